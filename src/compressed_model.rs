@@ -21,26 +21,30 @@ pub struct ReferenceFrame {
 pub struct Cluster {
     /// Index in the output of the proxy that replaces this cluster.
     pub output: u32,
-    /// Id of the leader: the member of this cluster to which the others were joined.
+    /// Id of the leader of this cluster: the Gaussian to which merging joined the other members.
     pub leader: u32,
-    /// Id and weight of each member of this cluster, in increasing order of ids, including the leader. A weight is the
-    /// share of the member in the proxy; the weights sum to 1.
+    /// Members (Gaussians) of this cluster, including the leader (the one that the others are merged into): pairs of
+    /// the id of a Gaussian and its weight, in increasing order of ids. The proxy is the weighted mean of the members;
+    /// the weights sum to 1.
     pub members: Vec<(u32, f64)>,
 }
 
 /// Proxies (Gaussians that each replace a merged cluster), computed before anything is written.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Proxies {
-    /// Stored parameters of the proxies, one row per cluster, for model formats that store a proxy like any other
-    /// Gaussian. `None` if each proxy is computed from its members frame by frame.
+    /// Stored parameters of the proxies (Gaussians that replace merged clusters), one row per cluster, in a model
+    /// format that stores a proxy as it stores any Gaussian. `None`: proxies have no stored parameters; each is
+    /// computed from its members at each frame.
     pub raw: Option<StoredParams>,
-    /// Indices of the clusters that no proxy represents well enough, increasing. The leader (most important member) of
-    /// such a cluster stays, unmerged.
+    /// Increasing indices of the clusters whose proxy (the Gaussian to replace the cluster) was refused, because no
+    /// Gaussian of the model format moves and fades like the members together. Such a cluster is not merged: its leader
+    /// (most important member) stays, the other members are removed.
     pub refused: Vec<usize>,
-    /// Largest distance between the position of a proxy and the position expected from its members, over all proxies
-    /// and sampled frames, scene units. `None` if every proxy follows its members exactly.
+    /// Largest distance between the position of a proxy (Gaussian that replaces a merged cluster) and the position
+    /// expected from its members (the Gaussians of the cluster), over all proxies and sampled frames, scene units.
+    /// `None` if every proxy follows its members exactly.
     pub deviation: Option<f64>,
-    /// Notes for the user about the proxies.
+    /// Notes for the user about the proxies (Gaussians that replace merged clusters).
     pub notes: Vec<String>,
 }
 
@@ -112,9 +116,10 @@ impl ParamDelta {
     }
 }
 
-/// Trajectory delta: values, varying in time, that refinement adds beside the constant [`ParamDelta`]. Holds one delta
-/// per keyframe; keyframes are evenly spaced from the first frame to the last, with linear interpolation between them.
-/// All keyframes have the same attributes. Without keyframes nothing is added.
+/// Trajectory delta: values that refinement adds to the attributes of the Gaussians and that vary in time, while a
+/// [`ParamDelta`] is constant. The field holds one delta per keyframe. Keyframes are evenly spaced from the first frame
+/// to the last; between them, deltas are interpolated linearly. All keyframes have values for the same attributes. An
+/// empty list adds nothing.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryDelta(pub Vec<ParamDelta>);
 
@@ -170,12 +175,15 @@ impl TrajectoryDelta {
 /// Compressed model: describes every Gaussian of the output by the Gaussians of the input that it comes from.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CompressedModel {
-    /// For every Gaussian of the output, in order: id of the input Gaussian, or of the cluster's leader for a proxy.
-    /// Increasing.
+    /// For every Gaussian of the output, in order, the id of an input Gaussian: the Gaussian itself if it is unmerged;
+    /// if it is a proxy (Gaussian that replaces a merged cluster), the leader (most important member) of its cluster.
+    /// The ids increase.
     pub kept: Vec<u32>,
-    /// Clusters of input Gaussians that are merged, in increasing order of their proxy's index in the output.
+    /// Clusters of input Gaussians that are merged, in increasing order of the index in the output of their proxy (the
+    /// Gaussian that replaces the cluster).
     pub clusters: Vec<Cluster>,
-    /// Merge parameters by which proxies are computed from the members of their clusters.
+    /// Merge parameters by which proxies (Gaussians that replace merged clusters) are computed from the members of
+    /// their clusters.
     #[serde(rename = "rule")]
     pub merge_params: MergeParams,
     /// Proxies, which replace the merged clusters.
@@ -183,9 +191,9 @@ pub struct CompressedModel {
     /// Parameter delta: values that refinement adds to the stored parameters, constant in time.
     #[serde(rename = "change")]
     pub delta: ParamDelta,
-    /// Trajectory delta: values, varying in time, that refinement adds to the attributes at each frame, on top of the
-    /// constant `delta`. Empty unless the model format stores the state of every Gaussian for every frame, and empty
-    /// if there are proxies.
+    /// Trajectory delta: values that refinement adds to the attributes at each frame, on top of the constant `delta`.
+    /// It has values only in a model that meets two conditions: its format stores the state of every Gaussian for every
+    /// frame, and no Gaussians are merged.
     #[serde(rename = "course")]
     pub trajectory_delta: TrajectoryDelta,
     /// Precision in which the deformation field is written, if the model has one.
@@ -195,8 +203,9 @@ pub struct CompressedModel {
 }
 
 impl CompressedModel {
-    /// Returns the compressed model of the Gaussians `kept` (increasing ids of the input), unchanged and unmerged, with
-    /// the exact deformation field and all SH coefficients. `rule` is stored but unused, since nothing is merged.
+    /// Returns the compressed model that keeps the Gaussians `kept` (increasing ids of the input) unchanged and removes
+    /// all others. Nothing is merged, and deformation field and SH coefficients stay exact. `rule` (merge parameters)
+    /// is stored, but has no effect without merged Gaussians.
     pub fn pruned(kept: Vec<u32>, rule: &MergeParams) -> Self {
         CompressedModel {
             kept,
@@ -210,14 +219,15 @@ impl CompressedModel {
         }
     }
 
-    /// Returns a copy of this model with `kept` (increasing ids of the input) in place of its own list of kept
-    /// Gaussians.
+    /// Returns a copy of this model in which the list of kept Gaussians is replaced by `kept` (increasing ids of the
+    /// input).
     pub fn with_kept(&self, kept: Vec<u32>) -> Self {
         CompressedModel { kept, ..self.clone() }
     }
 
-    /// Sets the computed `proxies`. Clusters for which no proxy was good enough ([`Proxies::refused`]) are dissolved:
-    /// the leader (most important Gaussian of the cluster) stays unchanged, the other members are removed.
+    /// Sets the computed `proxies` (Gaussians that replace merged clusters). A cluster whose proxy was refused
+    /// ([`Proxies::refused`]) is dissolved: its leader, the Gaussian to which the others were joined, stays unchanged,
+    /// and the other members are removed.
     pub fn set_proxies(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
         if !refused.is_empty() {
@@ -241,7 +251,7 @@ impl CompressedModel {
     }
 
     /// Returns the compressed model that consists of only the output Gaussians with the indices `places` (increasing).
-    /// The model must have no proxies.
+    /// The model must have no proxies (Gaussians that replace merged clusters).
     ///
     /// # Panics
     /// Panics if there is a proxy.

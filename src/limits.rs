@@ -4,13 +4,15 @@ use std::path::Path;
 
 use crate::error::{Error, Result};
 
-/// Maximum amounts that stages keep in memory at a time. They change memory and time of a run, never its result.
+/// Maximum amounts of data (frames, views, Gaussians) that stages keep in memory at a time. Lower limits make a run
+/// slower and smaller in memory; they never change its result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
     /// Maximum number of decoded frames that a reader keeps in memory for later reads, at least 1. Consecutive frames
     /// of a container are decoded together, because a tile holds several frames.
     pub max_kept_frames: usize,
-    /// Maximum number of frames of which the states of all Gaussians are in memory, ready to be rendered; at least 1.
+    /// Maximum number of frames that are rendered together, at least 1. For each, the states of all Gaussians are in
+    /// memory.
     pub frames_together: usize,
     /// Maximum number of views rendered at the same time; at least 1.
     pub views_together: usize,

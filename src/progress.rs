@@ -17,8 +17,8 @@ pub trait EventSink: Send + Sync {
     /// or an error.
     fn run_ended(&self) {}
 
-    /// Receives the event that a task begins. Returns the sink that receives the progress of the task and is dropped
-    /// when the task ends, or `None` if progress is not wanted. A task may begin while others run.
+    /// Receives the event that a task begins. Returns a new sink for the progress of the task, or `None` if progress is
+    /// not wanted. The new sink is dropped when the task ends. A task may begin while other tasks run.
     fn task_begun(&self, task: Task<'_>) -> Option<Box<dyn TaskSink>> {
         let _ = task;
         None

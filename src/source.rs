@@ -1,5 +1,5 @@
-//! Traits for reading the frames of a sequence. A source opens readers for blocks of Gaussians and counts what is read.
-//! The caller can announce to a reader which frames it will read.
+//! Traits for reading the frames of a sequence. A [`FrameSource`] opens readers for blocks of Gaussians and counts what
+//! they read. The caller can announce to a reader which frames it will read.
 
 use std::ops::{Add, Range, Sub};
 use std::sync::Arc;
@@ -43,8 +43,8 @@ impl Ids<'_> {
     }
 }
 
-/// Plan of the frames that the caller will read from a reader. With the plan, the reader decodes a tile (some Gaussians
-/// at consecutive frames) once and keeps only the planned frames.
+/// Plan of the frames that the caller will read from a reader. The plan saves time: the reader decodes a tile (some
+/// Gaussians at consecutive frames) once, and keeps only the planned frames of it.
 #[derive(Debug, Clone)]
 pub struct ReadPlan {
     /// Frames that will be read, in increasing order; `None` means every frame.
@@ -67,9 +67,9 @@ impl ReadPlan {
         ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
-    /// Returns a copy of this plan with the limit `frames` (at least 1): the maximum number of frames that a reader
-    /// keeps in memory after it has decoded a tile. A tile holds several consecutive frames. A small limit saves memory
-    /// but makes the reader decode tiles repeatedly.
+    /// Returns a copy of this plan with the limit `frames` (at least 1) on the frames that a reader keeps in memory. A
+    /// reader that decodes a tile gets several consecutive frames at once, and keeps them for later reads. A small
+    /// limit saves memory but makes the reader decode tiles repeatedly.
     pub fn with_max_kept_frames(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
@@ -123,7 +123,8 @@ impl Add for Reads {
 impl Sub for Reads {
     type Output = Reads;
 
-    /// Returns the amounts read since `before` was counted.
+    /// Returns the amounts read between two counts of one source: `before`, the earlier count, and `self`, the later
+    /// one.
     fn sub(self, before: Reads) -> Reads {
         Reads {
             bytes: self.bytes - before.bytes,
@@ -162,25 +163,25 @@ pub trait FrameSource: Send + Sync {
     /// Returns the number of Gaussians, the time stamps of the frames and the attributes that vary in time.
     fn info(&self) -> &SequenceInfo;
 
-    /// Opens a reader that returns the Gaussians `ids` in this order. Work that does not depend on time is done once,
-    /// in this call.
+    /// Opens a reader that returns the Gaussians `ids`, in the order of `ids`. Work that does not depend on time is
+    /// done once, in this call.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 
-    /// Opens a reader for all Gaussians at the frames `_wanted`. The reader may take more memory per Gaussian than
-    /// readers of blocks. Returns `None` if reading block by block takes less time.
+    /// Opens a reader that returns all Gaussians at the frames of the plan `_wanted`. It may take more memory per
+    /// Gaussian than readers of blocks. Returns `None` if reading block by block takes less time.
     fn open_all(&self, _wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
     }
 
     /// Returns the function that computes the states of Gaussians from stored parameters. Returns `None` for models
-    /// that store the state at every frame (explicit trajectories). In such models, a change of a parameter is added to
-    /// the states at all frames.
+    /// that store the state at every frame (explicit trajectories). For these, an optimizer adds the change of a
+    /// parameter to the states at all frames.
     fn deformation(&self) -> Option<&dyn Deformation> {
         None
     }
 
-    /// Returns the decoder of pixel colors for models that store features in place of colors. For these models the
-    /// colors in a state only approximate the renders. `None` for models that store colors.
+    /// Returns the decoder of pixel colors for models that store features in place of colors, and `None` for models
+    /// that store colors. With a decoder, the colors in a frame state only approximate the renders.
     fn decoder(&self) -> Option<&dyn FeatureDecoder> {
         None
     }
@@ -190,8 +191,8 @@ pub trait FrameSource: Send + Sync {
         Reads::default()
     }
 
-    /// Returns the object that can fetch bytes from the disk ahead of a reader that needs them; `None` if this saves no
-    /// time.
+    /// Returns the object that can fetch bytes from the disk before a reader needs them. Returns `None` if this saves
+    /// no time.
     fn ahead(&self) -> Option<&dyn Prefetch> {
         None
     }
@@ -240,7 +241,8 @@ pub trait FeatureDecoder: Sync {
     fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
-/// Fetching of bytes from a disk before a reader needs them. A thread that does nothing else calls [`Prefetch::fetch`].
+/// Fetching of bytes from a disk before a reader needs them. Callers run [`Prefetch::fetch`] in a thread of its own,
+/// because it waits for the disk.
 pub trait Prefetch: Sync {
     /// Returns the number of consecutive frames that are fetched and decoded together. Such a frame block starts at a
     /// multiple of this number.
@@ -264,9 +266,9 @@ pub trait BlockReader: Send {
     /// the reader may keep in memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
-    /// Decodes the attributes `_want` at frame `_frame`, and at the frames that are stored in one block with it, so
-    /// that later calls of [`BlockReader::read`] only have to copy values. Decodes nothing for frames that the reader
-    /// may not keep in memory.
+    /// Decodes the attributes `_want` at frame `_frame`, and at the other frames of the same tile (frames that are
+    /// stored and decoded together). Later calls of [`BlockReader::read`] then only have to copy values. Decodes
+    /// nothing for frames that the reader may not keep in memory.
     fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
     }

@@ -29,8 +29,8 @@ use crate::codec::{TileStats, order_at, predict, shuffle_into, stats, zigzag};
 /// above zero.
 pub(crate) const BOUNDS: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
 /// Length in bytes of the fields at the start of a stored tile: the quantization step, the number of exceptions (values
-/// stored with their original bits), and how often the step is halved for static tracks. The exceptions follow these
-/// fields.
+/// stored with their original bits), and how often the step is halved for static tracks (components of a Gaussian that
+/// are stored as one number). The exceptions follow these fields.
 const HEAD_BYTES: usize = 16;
 /// Minimum number of values per exception (value stored with its original bits). A tile with more exceptions is stored
 /// in another encoding.
@@ -38,9 +38,9 @@ const VALUES_PER_EXCEPTION: usize = 16;
 /// Limit of the absolute value of a multiple of the quantization step. All multiples are below this limit, so that the
 /// differences of their differences fit 32 bits.
 const MAX_MULTIPLE: f64 = (1 << 28) as f64;
-/// zstd level of the trial that decides whether static tracks (components of a Gaussian whose values in all frames are
-/// stored as one number) use half the quantization step. Half the step makes more tracks static, but each of them takes
-/// a bit more space.
+/// zstd level of a trial compression. The trial decides whether static tracks (components of a Gaussian whose values in
+/// all frames are stored as one number) use half the quantization step. Half the step makes more tracks static, but
+/// each of them takes a bit more space.
 const TRIAL_LEVEL: i32 = 1;
 
 /// Encoded tile whose decoded values differ from the original ones by at most the error bound.
@@ -94,12 +94,13 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step for an error of at most `max_error`. The step is 2 (`max_error` − r), where r is the
-/// largest error that rounding a decoded value to f32 may add. It is determined from the largest absolute value in
-/// `values`.
+/// Returns the quantization step with which decoded values differ from `values` by at most `max_error`. The step is 2
+/// (`max_error` − r), where r is the largest error that rounding a decoded value to f32 may add. r follows from the
+/// largest absolute value in `values`.
 ///
-/// Values so large that neighboring f32 numbers are more than half of `max_error` apart do not count as the largest. If
-/// the error of such a value exceeds `max_error`, the value is stored with its original bits, as an exception.
+/// Values so large that neighboring f32 numbers are more than half of `max_error` apart are ignored when this maximum
+/// is taken. If the error of such a value exceeds `max_error`, the value is stored with its original bits, as an
+/// exception.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -112,8 +113,9 @@ struct Multiples {
     plane: usize,
     step: f64,
     halvings: u32,
-    /// Multiples of the quantization step, in the order of the tile's values. For a static track (all values stored as
-    /// one multiple), the step is the one that [`static_step`] returns; for other tracks it is `step`.
+    /// Multiples of the quantization step, in the order of the tile's values. The step depends on the track (one
+    /// component of one Gaussian over all frames): [`static_step`] for a static track, whose values are all stored as
+    /// one multiple, and `step` for all others.
     values: Vec<u32>,
     /// Whether each track (one component of one Gaussian over all frames) is moving. A track that is not moving is
     /// static: all of its values are stored as one multiple.
@@ -123,10 +125,11 @@ struct Multiples {
 }
 
 impl Multiples {
-    /// Quantizes `values`, which are frames of `plane` values each, with an error of at most `max_error`. A track (one
-    /// component of one Gaussian over all frames) is static if one multiple of its step is within the error bound of
-    /// all its values. The step of static tracks is `step`, halved `halvings` times (0 or 1); the step of all other
-    /// tracks is `step`.
+    /// Quantizes `values`, which are frames of `plane` values each, with an error of at most `max_error`. A track is
+    /// one component of one Gaussian over all frames.
+    /// - The step of a static track is `step`, halved `halvings` times (0 or 1). A track is static if one multiple of
+    ///   this step is within the error bound of all its values.
+    /// - The step of all other tracks is `step`.
     fn new(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
         let resting_step = static_step(step, halvings);
         // Returns the multiple of `step` nearest to `x`, if it is within the error bound of all of `values`.
@@ -169,8 +172,8 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Returns these multiples for the first frame only: drops the multiples and exceptions (values stored with their
-    /// original bits) of all later frames.
+    /// Keeps the first frame only: drops the multiples and exceptions (values stored with their original bits) of all
+    /// later frames.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
@@ -211,9 +214,10 @@ impl Multiples {
         if cost(2) < cost(1) { 2 } else { 1 }
     }
 
-    /// Returns the bytes that zstd compresses: a mask with one bit per track that tells which tracks are moving; the
-    /// values of the first frame, as integer multiples of the quantization step; and the prediction errors of moving
-    /// tracks in the later frames. `order` is the number of earlier frames that predict a value.
+    /// Returns the bytes that zstd compresses: a mask with one bit per track (component of a Gaussian) that tells which
+    /// tracks are moving; the values of the first frame, as integer multiples of the quantization step; and the
+    /// prediction errors of moving tracks in the later frames. `order` is the number of earlier frames that predict a
+    /// value.
     fn body(&self, order: u8) -> Vec<u8> {
         let mut out = vec![0; self.plane.div_ceil(8)];
         for (track, _) in self.moves.iter().enumerate().filter(|(_, moves)| **moves) {
@@ -231,8 +235,9 @@ fn static_step(step: f64, halvings: u32) -> f64 {
     if halvings == 0 { step } else { 0.5 * step }
 }
 
-/// Decoder of the lossy encoding of a tile: the fields that are stored before its zstd frame, and the number of moving
-/// tracks.
+/// Decoder of a lossy tile: turns the stored bytes of the tile into the quantized value of each track (component of a
+/// Gaussian), and quantized values into f32 values. Holds what it has read of the tile so far: the fields before the
+/// zstd frame ([`BoundedTracks::read_head`]), then the number of moving tracks ([`BoundedTracks::read_mask`]).
 #[derive(Debug, Default)]
 pub(crate) struct BoundedTracks {
     /// Quantization steps: first of static tracks (components of a Gaussian whose values in all frames are stored as
@@ -289,9 +294,9 @@ impl BoundedTracks {
         self.mask_bytes() + 4 * self.frames * self.plane
     }
 
-    /// Counts the moving tracks (components of a Gaussian that change in the tile) in the mask at the start of `bytes`,
-    /// the decompressed bytes of the tile. The mask has one bit per track. Also checks the length of `bytes`. An error
-    /// says what was found instead of a valid tile.
+    /// Reads the mask at the start of `bytes`, the decompressed bytes of the tile. The mask has one bit per track
+    /// (component of a Gaussian), which is set if the track changes in the tile (is moving). Stores the number of
+    /// moving tracks, and checks the length of `bytes`. An error says what was found instead of a valid tile.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;
@@ -382,8 +387,8 @@ mod tests {
         Ok(values)
     }
 
-    /// Generates tiles with tracks that are constant, drift, jitter or jump; some tiles have one value of arbitrary
-    /// bits.
+    /// Generates tiles with tracks (components of a Gaussian) that are constant, drift, jitter or jump; some tiles have
+    /// one value of arbitrary bits.
     fn tiles() -> impl Strategy<Value = (usize, usize, Vec<f32>)> {
         let track = |frames: usize| {
             let from = prop_oneof![-3.0f32..3.0, -2e5f32..2e5, Just(0.0)];

@@ -286,7 +286,7 @@ impl TileDecoder {
         self.shuffled.capacity() + 4 * (a.capacity() + b.capacity()) + self.tracks.memory()
     }
 
-    /// Decodes the next frame of a tile in the lossless encoding into `out`.
+    /// Decodes the next frame of a tile in the lossless encoding. Writes the bits of its f32 values to `out`.
     fn step(&mut self, out: &mut [u32]) {
         let plane = out.len();
         let [b0, b1, b2, b3]: [&[u8]; 4] = std::array::from_fn(|weight| {
@@ -322,7 +322,7 @@ impl TileDecoder {
         }
     }
 
-    /// Decodes the values of the next frame of a tile in the lossy encoding, as multiples of the quantization step.
+    /// Decodes the next frame of a tile in the lossy encoding into `recent[0]`, as multiples of the quantization step.
     /// Values that are the same in all frames are stored once and are decoded at the first frame only.
     fn step_multiples(&mut self) {
         let [before, second_before] = &mut self.recent;

@@ -69,7 +69,7 @@ impl MappedFile {
     }
 
     /// Reads `range` in successive chunks and calls `each` with the offset and the bytes of every chunk. Every chunk
-    /// has [`CHUNK_BYTES`] bytes except the last one, which may be shorter. `chunk` is a buffer.
+    /// has [`CHUNK_BYTES`] bytes except the last one, which may be shorter. The bytes are read into the buffer `chunk`.
     pub(crate) fn read_chunks(
         &self,
         range: std::ops::Range<u64>,
@@ -101,8 +101,8 @@ impl MappedFile {
         }
     }
 
-    /// Reads the bytes of `range` from disk into the page cache of the operating system and waits for them. This
-    /// process keeps none of them.
+    /// Reads the bytes of `range` from disk into the page cache of the operating system and waits for them. They pass
+    /// through the buffer `chunk`, and this process keeps none of them.
     pub(crate) fn fetch(&self, range: std::ops::Range<u64>, chunk: &mut Vec<u8>) -> Result<()> {
         self.read_chunks(range, chunk, |_, _| Ok(()))
     }

@@ -78,10 +78,12 @@ impl Index {
         Ok(varies)
     }
 
-    /// Checks and hashes all entries in one pass, in which it remembers only the last constant tile (all frames equal)
-    /// of each column and Gaussian block. Returns for every column whether its values differ between frames, and
-    /// whether the pass has shown that no two tiles overlap. The pass shows this only if the tiles lie in the file in
-    /// the order of the index.
+    /// Checks and hashes all entries in one pass over the index. Returns
+    /// - for every column, whether its values differ between frames,
+    /// - whether the pass has shown that no two tiles overlap in the file. It shows this only if the tiles lie in the
+    ///   file in the order of the index.
+    ///
+    /// The pass remembers only the last constant tile (all frames equal) of each column and Gaussian block.
     fn check_entries(
         &self,
         file: &MappedFile,
@@ -139,8 +141,9 @@ impl Index {
     }
 }
 
-/// Checks that opening, checking or recovering a container needs at most `memory` bytes of memory. `needed` is the
-/// number of bytes that it needs, `offset` the place in the file that the error names.
+/// Fails if `needed` is larger than `memory`. `needed` is the number of bytes of memory that opening, checking or
+/// recovering a container takes, `memory` the number of bytes allowed, and `offset` the place in the file that the
+/// error names.
 pub(crate) fn check_memory(offset: u64, needed: u64, memory: u64) -> std::result::Result<(), Fault> {
     if needed <= memory {
         return Ok(());

@@ -114,7 +114,8 @@ impl Layout {
         (range.end - range.start) as u32
     }
 
-    /// Returns the size in bytes of the largest tile, decoded, of a sequence of `frames` frames.
+    /// Returns the decoded size in bytes of the largest tile (one column for a block of Gaussians and frames) in a
+    /// sequence of `frames` frames.
     pub(crate) fn largest_tile(&self, frames: u64) -> u64 {
         let widest = self.columns.iter().map(|column| column.width).max().unwrap_or(0);
         let gaussians = self.gaussians.min(self.gaussian_block.into());

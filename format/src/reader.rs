@@ -56,7 +56,7 @@ pub struct TileBuffer {
     zstd: Option<Decompressor<'static>>,
 }
 
-/// Counts of the tile data that a reader has read so far.
+/// Counts of the data of tiles (each one column for a block of Gaussians and frames) that a reader has read so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TileReadCounts {
     /// Number of bytes of stored tile data that were read from the file.
@@ -264,7 +264,8 @@ impl Reader {
         self.digest
     }
 
-    /// Reads the entry of a tile in the index. Fails if there is no such tile.
+    /// Reads the index entry of the tile `at`, which states how the tile is stored and summarizes its values. Fails if
+    /// there is no such tile.
     pub fn tile_info(&self, at: TileId) -> Result<TileInfo> {
         let (_, tile) = self.record(at)?;
         Ok(TileInfo {
@@ -300,8 +301,9 @@ impl Reader {
         self.read_record(&tile, buffer)
     }
 
-    /// Returns the values of a tile. They are read by system calls into `buffer`, never through the memory map, and
-    /// checked against the checksum. A file that is cut short at any moment thus causes an error and nothing worse.
+    /// Returns the values of the tile `at` (one column for a block of Gaussians and frames). They are read by system
+    /// calls into `buffer`, never through the memory map, and checked against the checksum. A file that is cut short at
+    /// any moment thus causes an error and nothing worse.
     pub fn read_tile<'a>(&self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         self.read_record(&self.record(at)?.1, buffer)
     }
@@ -315,7 +317,7 @@ impl Reader {
         }
     }
 
-    /// Tells the operating system that the stored bytes of tiles will be read soon, so that it reads them from disk
+    /// Tells the operating system that the stored bytes of `tiles` will be read soon, so that it reads them from disk
     /// meanwhile. Takes no memory of this process. Read errors are ignored here; they appear when the tiles are read.
     pub fn prefetch_in_background(&self, tiles: impl IntoIterator<Item = TileId>) {
         let mut pending = 0..0;
@@ -331,7 +333,7 @@ impl Reader {
         self.file.will_need(pending);
     }
 
-    /// Reads the stored bytes of tiles from disk into the page cache of the operating system and waits for them, so
+    /// Reads the stored bytes of `tiles` from disk into the page cache of the operating system and waits for them, so
     /// that threads that decode these tiles need not wait. Takes a small buffer. Read errors are ignored here; they
     /// appear when the tiles are read.
     pub fn prefetch_and_wait(&self, tiles: impl IntoIterator<Item = TileId>) {
@@ -418,8 +420,8 @@ impl TileBuffer {
     }
 }
 
-/// Reads the stored bytes of a tile into `buffer`, checks their checksum and decodes them. The caller must have checked
-/// the record `tile` against the layout.
+/// Reads the stored bytes of a tile into `buffer`, checks their checksum and decodes them. `tile` is the index entry of
+/// the tile, which states where and how it is stored. The caller must have checked this entry against `layout`.
 pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, buffer: &mut TileBuffer) -> Result<()> {
     let TileBuffer { stored, decoder, values, zstd } = buffer;
     read_stored(file, tile, stored)?;
@@ -440,14 +442,14 @@ pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, b
     Ok(())
 }
 
-/// Reads the stored bytes of a tile into `stored` and checks their checksum.
+/// Reads the stored bytes of the tile with the index entry `tile` into `stored` and checks their checksum.
 fn read_stored(file: &MappedFile, tile: &TileRecord, stored: &mut Vec<u8>) -> Result<()> {
     stored.resize(tile.stored_bytes as usize, 0);
     file.read_at(tile.offset, stored)?;
     check_payload(tile, xxh3_64(stored)).map_err(|fault| fault.at(file.path()))
 }
 
-/// Decompresses the stored bytes of a tile that is not raw, so that `decoder` can decode its frames.
+/// Decompresses `stored`, the stored bytes of a tile that is not raw, so that `frames` can decode its frames.
 fn decompress(
     file: &MappedFile,
     layout: &Layout,
@@ -469,7 +471,7 @@ fn decompress(
         .map_err(|found| Fault::new(tile.offset, format!("{} bytes of {}", 4 * values, tile.id), found).at(file.path()))
 }
 
-/// Returns the number of values that a tile has per frame.
+/// Returns the number of values per frame of the tile with the index entry `tile`: components times Gaussians.
 fn plane_len(layout: &Layout, tile: &TileRecord) -> usize {
     layout.columns[tile.id.column as usize].width as usize * layout.block_len(tile.id.gaussian_block) as usize
 }
@@ -485,7 +487,7 @@ pub(crate) fn read_header(file: &MappedFile) -> Result<(Layout, Vec<u8>)> {
     Ok((Layout::from_header(&header).map_err(fault)?, header))
 }
 
-/// Checks that `computed`, the checksum of the stored bytes of a tile, equals the checksum in the tile's record.
+/// Checks that `computed`, the checksum of the bytes read for a tile, equals the checksum in its index entry `tile`.
 fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fault> {
     if computed == tile.checksum {
         return Ok(());
@@ -494,8 +496,9 @@ fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fa
     Err(Fault::new(tile.offset, expected, format!("{computed:016x}")))
 }
 
-/// Checks the footer, whose record is at byte `offset` of the file, against the header. The footer's payload must have
-/// the length `payload_bytes`, which is the number of bytes between the footer record and the trailer.
+/// Checks that the footer belongs to the file's header, and that its numbers of frames and tiles agree with `layout`
+/// and with the length of its payload. `offset` is the offset of the footer record in the file, `payload_bytes` the
+/// number of bytes between this record and the trailer.
 fn check_footer(
     footer: &FooterRecord,
     layout: &Layout,

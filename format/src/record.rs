@@ -189,8 +189,8 @@ impl TileRecord {
             * layout.block_len(self.id.gaussian_block) as usize
     }
 
-    /// Checks the record, which lies at `place` in the file, against the layout: the tile exists and has a legal size,
-    /// and its stored bytes lie within `payloads`.
+    /// Checks this record against `layout`: the tile exists and has a legal size, and its stored bytes lie within the
+    /// range `payloads` of the file. `place` is the offset of the record in the file.
     pub(crate) fn check(&self, layout: &Layout, payloads: std::ops::Range<u64>, place: u64) -> Result<(), Fault> {
         if layout.index_of(self.id).is_none() {
             return Err(Fault::new(place + 4, "a column and a Gaussian block of this container", self.id));
@@ -263,7 +263,7 @@ pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER_BYTES as usize], offset: u
 }
 
 /// Hash (xxh3-64) that identifies the content of a container: header, time stamps, and the records of all tiles in the
-/// order of the index. The offset in the records counts as 0, so that the order of writing does not matter.
+/// order of the index. The offset of a tile is hashed as 0, so that the order of writing does not matter.
 pub(crate) struct Digest(Xxh3);
 
 impl Digest {

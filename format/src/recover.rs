@@ -82,8 +82,8 @@ pub fn recover_within(src: impl AsRef<Path>, dst: impl AsRef<Path>, memory: u64)
     Ok(report)
 }
 
-/// Creates an encoded tile for the writer from the record `tile` of a damaged file and the tile's stored bytes, without
-/// encoding its values again.
+/// Creates an encoded tile for [`crate::Writer::write_tile`] from the record `tile` (header of the tile in the damaged
+/// file) and `stored`, the stored bytes of the tile, without encoding its values again.
 fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     let column = &layout.columns[tile.id.column as usize];
     EncodedTile {
@@ -99,12 +99,13 @@ fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     }
 }
 
-/// Intact records that were found in a file: time stamps by frame block, and tiles by their position in the index.
+/// Intact content that was found in a damaged file: the time stamps of each frame block, by its number, and the record
+/// (header) of each tile, by its position in the index.
 struct FoundRecords {
     times: HashMap<u32, Vec<f64>>,
     tiles: HashMap<u64, TileRecord>,
-    /// Constant tiles (all frames equal) that do not share the stored bytes of an earlier tile, by the offset of these
-    /// bytes.
+    /// Records (headers) of constant tiles (all frames equal) that have stored bytes of their own, which later tiles
+    /// may share. The key is the offset of these bytes.
     constants: HashMap<u64, TileRecord>,
     skipped: u64,
     /// Number of bytes of all time stamps found (8 per frame).

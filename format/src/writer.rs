@@ -43,9 +43,9 @@ pub struct Writer {
     times: Vec<f64>,
     /// Unnamed temporary file that contains the record of tile i at byte 64·i, or zeros if the tile is not written yet.
     index: File,
-    /// Number of tiles in the frame blocks appended so far; `written` is the number of these tiles that have been
-    /// written.
+    /// Number of tiles in the frame blocks appended so far, written or not.
     tiles: u64,
+    /// Number of tiles written so far.
     written: u64,
     /// Last constant tile (all frames equal) written for each column and Gaussian block; empty before the first frame
     /// block.
@@ -130,8 +130,9 @@ impl Writer {
         Ok(block)
     }
 
-    /// Writes one tile. Fails if there is no such tile, if its time stamps have not been appended, if it was written
-    /// before, or if `tile` has another shape or a larger error bound than its column.
+    /// Writes `tile` as the tile `at` (one column for a block of Gaussians and frames). Fails if there is no such tile,
+    /// if its time stamps have not been appended, if it was written before, or if `tile` has another shape or a larger
+    /// error bound than its column.
     pub fn write_tile(&mut self, at: TileId, tile: &EncodedTile) -> Result<()> {
         let (index, frames) = self.unwritten_entry(at)?;
         let &ColumnSpec { width, max_error, .. } = &self.layout.columns[at.column as usize];
@@ -174,10 +175,10 @@ impl Writer {
         Ok(())
     }
 
-    /// Writes a tile that equals the last constant tile (all frames equal) of its column and Gaussian block. The file
-    /// gets the same bytes as from [`Writer::write_tile`] with that constant tile, but nothing is encoded again. Fails
-    /// if there is no such tile, if its time stamps have not been appended, if it was written before, or if no constant
-    /// tile came before it.
+    /// Writes the tile `at` as a copy of the last constant tile (all frames equal) of its column and Gaussian block.
+    /// The file gets the same bytes as if the values had been encoded again and given to [`Writer::write_tile`]. Fails
+    /// if the layout has no tile `at`, if its time stamps have not been appended, if it was written before, or if no
+    /// constant tile of its column and Gaussian block was written before.
     pub fn repeat_tile(&mut self, at: TileId) -> Result<()> {
         let (index, frames) = self.unwritten_entry(at)?;
         let slot = index as usize % self.constants.len();
@@ -214,8 +215,9 @@ impl Writer {
         Ok(bytes.iter().any(|&byte| byte != 0))
     }
 
-    /// Adds the index entry `record` of a tile at position `index` of the index (table of tiles). The tile's record was
-    /// appended to the file at `start`. After an error, the next record is written at `start` again.
+    /// Stores `record` at position `index` of the index (table of tiles), and counts its tile as written. The caller
+    /// has already appended the tile to the file, from offset `start` on. If this function fails, `start` is where the
+    /// file continues, so that the next tile overwrites the appended one.
     fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
         let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
@@ -227,7 +229,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Reads the index entries from the temporary file and calls `each` with successive chunks of them.
+    /// Reads the index (table of tiles) from its temporary file. Calls `each` with this writer and the bytes of
+    /// successive chunks of the index.
     fn for_each_index_chunk(&mut self, mut each: impl FnMut(&mut Writer, &[u8]) -> Result<()>) -> Result<()> {
         let end = RECORD_BYTES * self.tiles;
         let mut chunk = Vec::new();

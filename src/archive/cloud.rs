@@ -25,8 +25,10 @@ pub const ATTRIBUTES: [&str; 8] =
 /// [`super::step_size()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
-/// Number of known values from which a value is predicted: the value of the previous Gaussian, the mean of the previous
-/// four, and the values of the same Gaussian in the two previous planes (scalar components).
+/// Number of known values from which a value is predicted:
+/// - the value of the previous Gaussian
+/// - the mean value of the previous four Gaussians
+/// - the values of this Gaussian in the two planes (scalar components) that are coded before this plane
 const NEIGHBORS: usize = 4;
 /// Number of bits per axis in an index along the Morton curve; the three axes together take 63 bits.
 const CURVE_BITS: u32 = 21;
@@ -163,7 +165,7 @@ pub(crate) fn interleave_zeros(x: u64) -> u64 {
     x
 }
 
-/// Returns every third bit of `x`, packed together; the inverse of [`interleave_zeros`].
+/// Returns the bits 0, 3, 6, … of `x` as the bits 0, 1, 2, … of the result. Undoes [`interleave_zeros`].
 fn gather(x: u64) -> u64 {
     let mut x = x & 0x1249_2492_4924_9249;
     for (shift, mask) in [
@@ -178,9 +180,11 @@ fn gather(x: u64) -> u64 {
     x
 }
 
-/// Rounds all positions to `grid`, and measures them in quantization steps from the minimum on each axis. Returns the
-/// measured positions; the minimum, in quantization steps; and the number of low bits of a coordinate that the Morton
-/// curve leaves out, so that its index fits into 64 bits.
+/// Rounds all positions to `grid`. Returns three results:
+/// - all positions, in quantization steps from the minimum of the positions on each axis
+/// - this minimum on each axis, in quantization steps
+/// - the number of low bits of each coordinate that an index along the Morton curve leaves out, so that it fits into 64
+///   bits
 fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
     let all: Vec<[i64; 3]> = (0..position.len()).map(|i| position.row(i).map(|x| grid.multiple(x))).collect();
     let lowest = [0, 1, 2].map(|axis| all.iter().map(|p| p[axis]).min().unwrap_or(0));
@@ -308,8 +312,9 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
     decoder.is_finished().then_some((cloud, columns))
 }
 
-/// Adaptive entropy models of distances along the Morton curve. The number of bits of a distance is coded as two
-/// symbols. The bits below the highest one are stored as plain bits.
+/// Adaptive entropy models of the distances between consecutive positions along the Morton curve. The length of a
+/// distance in bits is coded as two symbols: the length divided by 16, and the remainder. The bits of the distance
+/// below its highest one are stored as plain bits.
 struct CurveDistances {
     high: SymbolModel,
     low: [SymbolModel; 4],
@@ -357,10 +362,11 @@ impl PlaneCoder {
         PlaneCoder { known: [none(), none()], sizes: none(), group: usize::MAX, models: Residuals::new() }
     }
 
-    /// Visits every Gaussian of one plane (scalar component) in coding order. `code` encodes or decodes one value. It
-    /// receives the index of the Gaussian, the known values to predict from, the expected absolute prediction error in
-    /// quantization steps, and the entropy models. It returns the quantized value as a multiple of the step, and the
-    /// prediction error (this multiple less the predicted one).
+    /// Visits every Gaussian of one plane (scalar component of all Gaussians) in coding order. `group`, `grid` and
+    /// `mean` are [`Plane::group`], quantization grid and mean (in steps) of this plane. Calls `code` to encode or
+    /// decode each value, with four arguments: the index of the Gaussian, the known values to predict from, the
+    /// expected absolute prediction error in quantization steps, and the entropy models. `code` returns two numbers in
+    /// steps: the quantized value, and the prediction error (quantized less predicted value).
     #[inline(always)]
     fn plane(
         &mut self,
@@ -436,8 +442,8 @@ pub(super) fn round_all(values: &mut [f32], step: i32) {
     values.iter_mut().for_each(|value| *value = grid.round(*value));
 }
 
-/// Returns the values of the attribute [`ATTRIBUTES`]`[attribute]`: all Gaussians' first scalar component, then their
-/// second, and so on.
+/// Returns the values of the attribute [`ATTRIBUTES`]`[attribute]`: the first scalar component of all Gaussians, then
+/// the second scalar component of all Gaussians, and so on.
 pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
     let own = components(cloud.sh_degree()).filter(move |plane| plane.2 == attribute);
     own.flat_map(|(column, c, _)| cloud.column(column).plane(c).iter().copied())

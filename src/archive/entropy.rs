@@ -18,15 +18,16 @@ const MIN_PROBABILITY: i16 = 8;
 const MIN_BIT_PROBABILITY: i32 = 64;
 /// Lower bound of the 64-bit state of the ANS coder; when the state is below it, the decoder reads another 32-bit word.
 const MIN_STATE: u64 = 1 << 31;
-/// Initial value of `rate`, the learning rate of a model. After each symbol, the model's probabilities move by
-/// 1/2^`rate` of the way to the probabilities of a model that is certain of this symbol. `rate` grows by one every 8
-/// symbols, so the model changes more slowly.
+/// Initial value of `rate`, a number that sets how fast a model learns. After each symbol, the model's probabilities
+/// move toward those of a model that is certain of this symbol, by the fraction 1/2^`rate` of the difference. `rate`
+/// grows by one every 8 symbols, so that the model changes more and more slowly.
 const FIRST_RATE: u32 = 3;
-/// Final value of the learning rate ([`FIRST_RATE`]): after each symbol, the probabilities move by 1/2^7 of the way.
+/// Largest value of `rate` (see [`FIRST_RATE`]): a model that has seen many symbols still moves its probabilities by
+/// 1/2^7 of the difference after each symbol.
 const LAST_RATE: u32 = 7;
 
-/// Cumulative probabilities of a model that is certain of a symbol, for each symbol, in units of 1/2^15. All other
-/// symbols have the probability [`MIN_PROBABILITY`].
+/// For each symbol: cumulative probabilities, in units of 1/2^15, of a model that is certain of this symbol. Such a
+/// model gives every other symbol the probability [`MIN_PROBABILITY`].
 const CERTAIN_STARTS: [[i16; SYMBOLS]; SYMBOLS] = {
     let mut known = [[0; SYMBOLS]; SYMBOLS];
     let mut symbol = 0;
@@ -73,9 +74,8 @@ impl SymbolModel {
         (start, end - start)
     }
 
-    /// Updates the probabilities after `symbol` was coded. Every probability stays at least `MIN_PROBABILITY`:
-    /// neighboring entries of `starts` move by the same fraction toward targets that are at least `MIN_PROBABILITY`
-    /// apart.
+    /// Updates the probabilities after `symbol` was coded: moves them toward those of a model that is certain of
+    /// `symbol`. Every probability stays at least `MIN_PROBABILITY`, because it is so in both models.
     fn learn(&mut self, symbol: usize) {
         let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
         self.seen = self.seen.saturating_add(1);
@@ -202,8 +202,8 @@ impl SymbolEncoder {
     }
 }
 
-/// Decoder of the bytes written by [`SymbolEncoder`]. Other bytes decode to arbitrary symbols;
-/// [`SymbolDecoder::is_finished`] is then false at the end.
+/// Decoder of the bytes written by [`SymbolEncoder`]. If the bytes are damaged, it returns arbitrary symbols, and
+/// [`SymbolDecoder::is_finished`] returns false at the end.
 #[derive(Debug)]
 pub(super) struct SymbolDecoder<'a> {
     state: u64,
@@ -248,9 +248,10 @@ impl<'a> SymbolDecoder<'a> {
         bit
     }
 
-    /// Removes the symbol that was just decoded from the state of the ANS coder, and reads a 32-bit word of the input
-    /// if the state has become too small. `place` is the value (in units of 1/2^15) by which the symbol was found; it
-    /// lies in the interval of the symbol, given by its start and length.
+    /// Advances the decoder after one symbol: removes the symbol from the state of the ANS coder, and reads a 32-bit
+    /// word of the input if the state is then below [`MIN_STATE`]. `place`: low 15 bits of the state, by which the
+    /// symbol was found. `(start, length)`: probability interval of the symbol, in units of 1/2^15; it contains
+    /// `place`.
     #[inline(always)]
     fn advance(&mut self, place: u32, (start, length): (u32, u32)) {
         self.state = u64::from(length) * (self.state >> PRECISION) + u64::from(place - start);
@@ -278,7 +279,7 @@ impl<'a> SymbolDecoder<'a> {
         value
     }
 
-    /// Fills the 64-bit buffer of plain bits with whole bytes.
+    /// Moves bytes from the input to the 64-bit buffer of plain bits, until less than one byte of the buffer is free.
     #[inline(never)]
     fn fill(&mut self) {
         while self.pending_bits <= 56 {
@@ -303,7 +304,8 @@ impl<'a> SymbolDecoder<'a> {
         value | self.bits(count - low) << 32
     }
 
-    /// Returns whether all symbols and bits of the input were read, and no more.
+    /// Returns whether the decoder has read the input exactly: no symbol and no byte is left, and no symbol was read
+    /// beyond the end.
     pub(super) fn is_finished(&self) -> bool {
         !self.is_short && self.state == MIN_STATE && self.words.len() == 0 && self.bits.is_empty()
     }

@@ -18,13 +18,13 @@ use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::AttributeValues;
 
-/// Decrease of the exponent `k` of a texel's quantization step 2^(k/8) for each doubling of the sum of its squared
-/// interpolation weights. The sum is over the Gaussians that read the texel. The squared error of the texel counts in
-/// proportion to this sum.
+/// Number that is subtracted from the exponent `k` of a texel's quantization step 2^(k/8) for each doubling of the
+/// texel's importance: with 4, each doubling divides the step by √2. The importance is the sum of the squared
+/// interpolation weights with which Gaussians read the texel; the squared error of the texel counts in proportion.
 const FINER_PER_OCTAVE: i32 = 4;
 
-/// Class of a weight whose quantization step has no offset. A class is a number that selects the quantization step: for
-/// any weight, it is this constant plus the offset of the weight's step, in eighths of an octave.
+/// Class of a weight whose quantization step has no offset. A class is a number that selects the quantization step of a
+/// value. For a weight, it is 100 plus the offset of the weight's step, in eighths of an octave.
 const ZERO_OFFSET_CLASS: u8 = 100;
 
 /// Use of a tensor by the deformation field. It decides how an archive stores the tensor.
@@ -52,8 +52,11 @@ pub(super) struct TensorEntry {
     pub(super) role: TensorRole,
     /// Exponent `k` of the quantization step 2^(k/8) of the tensor; see [`super::step_size()`].
     pub(super) step: i32,
-    /// Offsets that are added to the exponent `k` in `step`. A plane has one per channel; a matrix has one per row,
-    /// followed by one per column; any other tensor of weights has one per element. Empty if no offset is needed.
+    /// Offsets that are added to the exponent k of `step`: the values with an offset o have the step 2^((k + o)/8). If
+    /// empty, all offsets are 0. Else the number of offsets depends on the tensor:
+    /// - feature plane: one per channel
+    /// - matrix of weights: one per row, then one per column; a value gets the sum of both
+    /// - other tensor of weights: one per element
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
     /// Mean of the texels that the deformation field reads, in quantization steps, for a feature plane; 0 for other
@@ -73,8 +76,11 @@ pub struct FieldSteps(pub BTreeMap<String, TensorSteps>);
 pub struct TensorSteps {
     /// Exponent `k` of the quantization step 2^(k/8) of the tensor; see [`super::step_size()`].
     pub step: i32,
-    /// Offsets that are added to the exponent `k` in `step`. A plane has one per channel; a matrix has one per row,
-    /// followed by one per column; any other tensor of weights has one per element. Empty if no offset is needed.
+    /// Offsets that are added to the exponent k of `step`: the values with an offset o have the step 2^((k + o)/8). If
+    /// empty, all offsets are 0. Else the number of offsets depends on the tensor:
+    /// - feature plane: one per channel
+    /// - matrix of weights: one per row, then one per column; a value gets the sum of both
+    /// - other tensor of weights: one per element
     pub channels: Vec<i8>,
 }
 
@@ -112,8 +118,8 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the number of places (row, column) of a feature plane, each of which holds one value per channel: rows
-    /// times columns. Returns 0 for a tensor with a single channel.
+    /// Returns the number of places of the tensor (pairs of a row and a column) for which a coder keeps an error
+    /// average from channel to channel. Returns 0 for a tensor with a single channel, which needs no averages.
     pub(super) fn places(&self) -> usize {
         let [channels, rows, columns] = self.extents();
         if channels > 1 { rows.saturating_mul(columns) } else { 0 }
@@ -144,8 +150,12 @@ impl TensorEntry {
         fits && channels && super::STEP_NUMBERS.contains(&self.step)
     }
 
-    /// Returns the key of the family of tensors with which this tensor shares entropy models. Families are planes of
-    /// the same kind and size, matrices, and vectors.
+    /// Returns the key of a group of tensors that share entropy models with this tensor. Tensors with equal keys are
+    /// one group:
+    /// - `(0, columns)`: planes over two spatial axes, with this number of columns
+    /// - `(1, columns)`: planes over one spatial axis and time, with this number of columns
+    /// - `(2, 0)`: matrices
+    /// - `(3, 0)`: all other tensors
     fn family(&self) -> (u8, usize) {
         match self.role {
             TensorRole::Plane(_) => (0, self.shape[3]),
@@ -155,9 +165,10 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the quantization grid of a value in channel `channel` with the class `class`. The class is a number that
-    /// an archive derives for each value: for a weight, the sum of the step offsets of its row and its column; for a
-    /// texel, the octave of its squared interpolation weights, summed over the Gaussians that read it.
+    /// Returns the quantization grid of a value in channel `channel` whose class is `class`. A class is a number that
+    /// writer and reader of an archive compute for each value:
+    /// - for a weight: [`ZERO_OFFSET_CLASS`] plus the step offsets of its row and of its column
+    /// - for a texel: a number that grows with the texel's total read weight; see [`texels::octaves`]
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
             TensorRole::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
@@ -187,8 +198,10 @@ impl TensorEntry {
         (0..rows).flat_map(|row| (0..columns).map(move |column| class_at(row, column))).collect()
     }
 
-    /// Calls `with` with the shape and the quantization grids of the tensor and returns its result. Returns `None`
-    /// without a call if the tensor has no quantized values.
+    /// Builds the description of this tensor that its coder needs (shape, stored rows and quantization grids), calls
+    /// `with` with it, and returns the result of `with`. Returns `None` without a call if no value of the tensor is
+    /// quantized. `readers` states where and when the deformation field is evaluated (positions of the Gaussians, box
+    /// of space, range of times). Of a feature plane, this determines the stored rows and the grid of each texel.
     fn with_quantized<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
         if self.values() == Some(0) {
             return None;
@@ -225,11 +238,13 @@ impl TensorEntry {
     }
 }
 
-/// Entropy models for each family of tensors that share them, with the key of the family ([`TensorEntry::family`]).
+/// Entropy models that several tensors share: pairs of the key of a group of tensors ([`TensorEntry::family`]) and the
+/// models of this group.
 struct SharedModels(Vec<((u8, usize), Residuals)>);
 
 impl SharedModels {
-    /// Returns the entropy models of the family of `entry`; creates them at the first call for this family.
+    /// Returns the entropy models that `entry` shares with all tensors of the same key ([`TensorEntry::family`]).
+    /// Creates the models at the first call for this key.
     fn residuals(&mut self, entry: &TensorEntry) -> &mut Residuals {
         let family = entry.family();
         let place = self.0.iter().position(|(known, _)| *known == family).unwrap_or_else(|| {
@@ -301,9 +316,9 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// Returns `tensor` rounded to the quantization grids of `steps`, as an archive would restore it. `position` holds the
-/// canonical positions, `space` is the box that the feature planes cover. Unlike an archive, treats all rows of a plane
-/// over time as read, so that each row keeps its own values.
+/// Returns `tensor` as an archive would restore it: rounded to the quantization grids of `steps`. `position` holds the
+/// canonical positions of the Gaussians; `space` is the box of space that the feature planes cover. One difference from
+/// an archive: in a plane over time, every row is rounded by itself, even for times that no frame has.
 pub fn round_tensor(
     tensor: &Tensor,
     role: TensorRole,

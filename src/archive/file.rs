@@ -33,8 +33,8 @@ const MAX_CONTENT_PER_BYTE: u64 = 512;
 /// Number of bytes that may be allocated for decoding any archive, however short its file is.
 const ALWAYS_ALLOWED_BYTES: u64 = 64 << 20;
 
-/// Maximum length in bytes of the table of contents. The table of a trained model has about 50 KB. The values parsed
-/// from a table take up to 16 times its bytes.
+/// Maximum length in bytes of the table of contents. The table of a trained model has about 50 KB. In memory, a parsed
+/// table takes up to 16 times as many bytes.
 const MAX_TABLE_BYTES: u64 = 1 << 20;
 
 /// Contents of the four sections, before compression.
@@ -189,9 +189,10 @@ impl ArchiveHeader {
         Ok(ArchiveHeader { whole, sections })
     }
 
-    /// Returns the number of bytes of memory for decoding, estimated from the header alone: twice the bytes of the
-    /// file, twice the bytes of the `blobs` (both are held as a whole and in parts), and 16 times the table of
-    /// contents.
+    /// Returns the number of bytes of memory that decoding takes, estimated from the header alone. It is the sum of:
+    /// - twice the length of the file
+    /// - twice the length of the `blobs`, because these bytes are copied into their parts
+    /// - 16 times the length of the table of contents
     pub(super) fn bytes(&self) -> u64 {
         let [[_, table, _], .., [_, blobs, _]] = self.sections;
         2 * self.whole + 16 * table + 2 * blobs
@@ -232,8 +233,9 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
     Ok((content, parts))
 }
 
-/// Checks that `bytes` bytes may be allocated for reading an archive of `length` bytes. Fails if they are too many.
-/// `None` stands for a number that overflowed, and fails as well.
+/// Checks that `bytes`, the size of the decoded content of an archive file of `length` bytes, is not suspiciously
+/// large. Fails if it exceeds 64 MiB plus 512 bytes per byte of the file. `None` stands for a number that overflowed
+/// and fails as well.
 pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
     let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {

@@ -17,17 +17,18 @@ use crate::model::AttributeValues;
 const GAUSSIANS: usize = 256;
 /// Number of times at which the field is sampled for each sampled Gaussian.
 const TIMES: usize = 4;
-/// Unit of the offsets of quantization steps, in eighths of an octave. Offsets are whole multiples of it, that is, of
-/// half an octave.
+/// Step between possible offsets of quantization steps, in eighths of an octave. Offsets are multiples of 4 eighths,
+/// that is, of half an octave (a factor of √2).
 const OFFSET_UNIT: f64 = 4.0;
 /// Maximum absolute offset of a quantization step, in units of [`OFFSET_UNIT`].
 const MAX_OFFSET: f64 = 6.0;
 
-/// Returns, for each tensor of the deformation field, the offsets of its quantization steps, in eighths of an octave:
-/// the exponent (base 2) of a step is changed by these amounts. A plane of features has one offset per channel; a
-/// matrix has one per row, followed by one per column. `position` holds the canonical positions, `space` is the box
-/// that the planes cover, `times` are the first and last time. Returns an empty map if the field has no planes or an
-/// unknown structure.
+/// Returns, for each tensor of the deformation field, offsets of its quantization steps, by tensor name. An offset of 8
+/// doubles a step. A feature plane has one offset per channel; a matrix has one per row, then one per column. Returns
+/// an empty map if the field has no planes or an unknown structure.
+/// - `position`: canonical positions of the Gaussians
+/// - `space`: box of space that the planes cover
+/// - `times`: first and last time of the sequence
 pub fn step_offsets(
     field: &BTreeMap<String, TensorRole>,
     tensors: &Tensors,
@@ -86,9 +87,9 @@ pub fn step_offsets(
     found
 }
 
-/// Adds the offsets of the quantization steps ([`importance_offsets`]) of the weights and of the bias of `layer` to
-/// `found`, under the names of these two tensors. `rows`: importance of each output (effect of its errors on the
-/// result). `columns`: mean square of each input.
+/// Adds two entries to `found`: the offsets of quantization steps ([`importance_offsets`]) of the weights of `layer`
+/// and those of its bias, each by tensor name. `rows`: importance of each output of the layer, that is, how strongly
+/// its errors change the result of the field. `columns`: mean square of each input of the layer.
 fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
     found.insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
     found.insert(format!("{}.bias", layer.name), importance_offsets(rows));
@@ -141,8 +142,8 @@ impl<'a> FieldWeights<'a> {
         Some(WeightLayer { name, weight, bias })
     }
 
-    /// Returns the layers of the network `name` that are numbered `first`, `first + by`, and so on; `None` if there is
-    /// none.
+    /// Returns the layers of the network `name` that are numbered `first`, `first + by`, `first + 2 * by` and so on, up
+    /// to the first number that is missing. Returns `None` if layer `first` is missing.
     fn layers(&self, name: &str, first: usize, by: usize) -> Option<Vec<WeightLayer<'a>>> {
         let layers = (0..).map_while(|k| self.layer(format!("{name}.{}", first + k * by)));
         Some(layers.collect::<Vec<_>>()).filter(|layers| !layers.is_empty())
@@ -174,9 +175,9 @@ impl WeightLayer<'_> {
         inputs.chunks_exact(self.inputs()).flat_map(outputs_of).collect()
     }
 
-    /// Returns the importance of each input of the layer (effect of its errors on the result). `outputs` is the
-    /// importance of each output; `active` is the fraction of samples in which each input is above zero, that is,
-    /// passes the preceding ReLU.
+    /// Returns the importance of each input of the layer, given the importance of each output, `outputs`. Importance
+    /// says how strongly an error of a value changes the result of the field. `active`: for each input, the fraction of
+    /// samples in which it is above zero, that is, passes the ReLU before this layer.
     fn backward(&self, outputs: &[f64], active: &[f64]) -> Vec<f64> {
         let mut inputs = vec![0.0; self.inputs()];
         for (row, output_importance) in self.weight.data.chunks_exact(self.inputs()).zip(outputs) {

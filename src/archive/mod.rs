@@ -1,5 +1,5 @@
-//! Compressed archive of a model (`.gsz`): canonical Gaussians and deformation field, quantized with the coarsest steps
-//! that keep the renders good, and entropy coded.
+//! Compressed archive of a model (`.gsz`): canonical Gaussians and deformation field, quantized with steps that the
+//! caller chooses, and entropy coded.
 //!
 //! Input: [`ArchiveContent`] and [`QuantizationSteps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back.
 //! Memory: twice the content. Every quantized value is restored with an error of at most half a quantization step,
@@ -48,7 +48,7 @@ pub struct ArchiveContent {
     pub cloud: Gaussians,
     /// Columns: values of the Gaussians beyond their attributes. Each column has one row per Gaussian of `cloud`.
     pub columns: Vec<Column>,
-    /// Use of each tensor by the deformation field, by name; empty if there is no field.
+    /// For each tensor, by name: how the deformation field uses it. Empty if the model has no deformation field.
     pub field: BTreeMap<String, TensorRole>,
     /// Tensors of the deformation field, by name.
     pub tensors: Tensors,
@@ -79,7 +79,7 @@ pub struct EncodedArchive {
     pub bytes: Vec<u8>,
     /// Size of the archive in bytes, divided by purpose.
     pub parts: ArchiveSize,
-    /// For each Gaussian in the order of the archive, its index in the encoded [`ArchiveContent`].
+    /// For each Gaussian of the archive, in order: the index that it had in the [`ArchiveContent`] before encoding.
     pub order: Vec<u32>,
     /// Approximate number of bits that each attribute, column and quantized tensor takes, by name.
     pub bits: BTreeMap<String, f64>,
@@ -94,7 +94,8 @@ struct Table {
     /// would round these times.
     times: [u32; 2],
     tensors: Vec<TensorEntry>,
-    /// Number of extra bytes per Gaussian that belong to no attribute.
+    /// Number of bytes per Gaussian in [`ArchiveContent::extra_bytes`]: stored values that belong to no attribute, such
+    /// as other PLY properties.
     beside: usize,
     /// Name and length in bytes of each entry of [`ArchiveContent::files`], in the order in which their bytes are
     /// stored.

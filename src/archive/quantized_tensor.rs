@@ -38,8 +38,8 @@ pub(super) struct QuantizedTensor<'a> {
 struct Context {
     /// Values of the neighbors of the place, less the mean of the tensor.
     values: [f32; NEIGHBORS],
-    /// Expected absolute prediction error, in quantization steps of the place: a weighted mean of the errors of its
-    /// neighbors and of the moving average of the errors at the same place in earlier channels.
+    /// Expected absolute prediction error at the place, in quantization steps. It is a weighted mean of two values: the
+    /// errors at neighboring places, and the moving average of the errors at this place in earlier channels.
     size: f32,
 }
 
@@ -68,8 +68,8 @@ impl QuantizedTensor<'_> {
         }
     }
 
-    /// Fits the weights with which a value is predicted from its neighbors, for the least squared prediction error.
-    /// Rounds `data` in place to the quantization grids.
+    /// Returns predictor weights (with which a value is predicted from its neighbors) that give the least squared
+    /// prediction error for the values `data`. Also rounds `data` in place to the quantization grids.
     pub(super) fn fit(&self, data: &mut [f32]) -> PredictorWeights<NEIGHBORS> {
         let mut fit = PredictorFit::new();
         self.visit(data, |_, value, context, grid| {
@@ -115,10 +115,14 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Visits every place (row and column) that is read, row by row. `code` encodes or decodes one value. It receives
-    /// the index of the place in its channel, the value in `data`, the known neighbors and the quantization grid. It
-    /// returns the restored value and the absolute prediction error in quantization steps; later places are predicted
-    /// from both. Places that are never read get the mean of their neighbors.
+    /// Visits every place (row and column) of every channel in coding order. Sets each value in `data`:
+    /// - at a place that the field reads: to the first of the two numbers that `code` returns
+    /// - at a place in a stored row that the field never reads: to the mean of its neighbors
+    /// - in a row that is not stored: to the value of the nearest stored row
+    ///
+    /// `code` encodes or decodes one value. Arguments: index of the place in its channel, value in `data`, known
+    /// neighbors, quantization grid. Results: restored value, and absolute prediction error in quantization steps.
+    /// Later places are predicted from both results.
     #[inline(always)]
     fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;

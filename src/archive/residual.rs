@@ -8,8 +8,8 @@
 use super::entropy::{BitModel, SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 use super::step::{OFFSETS, PredictedMultiple};
 
-/// Classes of error magnitudes: the smallest magnitude of each class, and the number of plain bits for the position of
-/// a magnitude in the class. The last class has no upper limit.
+/// Classes of error magnitudes, each with two numbers: the smallest magnitude of the class, and the number of plain
+/// bits that store the position of a magnitude in the class. The last class has no upper limit.
 const CLASSES: [(u64, u32); SYMBOLS] = [
     (0, 0),
     (1, 0),
@@ -29,12 +29,12 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
     (128, 0),
 ];
 
-/// Number of entropy models. Each model is for half an octave of expected error sizes; the first begins at a quarter of
-/// a quantization step.
+/// Number of entropy models for the class of an error's magnitude. Each is used for one range of expected error sizes.
+/// Two ranges make up an octave (a factor of 2); the first range begins at a quarter of a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Number of entropy models of the sign for each [`PredictedMultiple::offset`]: one each for errors of magnitude 1, 2
-/// and 3, and one for all larger errors.
+/// Number of entropy models for the sign of an error, for each distance of the predicted value from the grid
+/// ([`PredictedMultiple::offset`]). Errors of magnitude 1, 2 and 3 have one model each, all larger errors share one.
 const SIGN_CONTEXTS: usize = 4;
 
 /// Entropy models of prediction errors. Similar planes or tensors share them.
@@ -42,7 +42,8 @@ const SIGN_CONTEXTS: usize = 4;
 pub(super) struct Residuals {
     /// Entropy model of the class of an error's magnitude, for each range of the expected error size.
     classes: [SymbolModel; CONTEXTS],
-    /// Entropy models of the sign of an error, by [`PredictedMultiple::offset`] and class of the magnitude.
+    /// Entropy models of the sign of an error. First index: distance of the predicted value from the grid
+    /// ([`PredictedMultiple::offset`]). Second index: class of the magnitude less 1, at most 3.
     signs: [[BitModel; SIGN_CONTEXTS]; OFFSETS],
 }
 
@@ -60,8 +61,9 @@ impl Residuals {
         &mut self.classes[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    /// Returns the entropy model of the sign of a prediction error. `offset`: [`PredictedMultiple::offset`] of the
-    /// prediction. `class`: class of the magnitude of the error (index in [`CLASSES`]), not 0.
+    /// Returns the entropy model of the sign of a prediction error that is not 0. `offset`: distance of the predicted
+    /// value from the quantization grid ([`PredictedMultiple::offset`]). `class`: class of the magnitude of the error
+    /// (index in [`CLASSES`]), at least 1.
     fn sign_model(&mut self, offset: usize, class: usize) -> &mut BitModel {
         &mut self.signs[offset][(class - 1).min(SIGN_CONTEXTS - 1)]
     }

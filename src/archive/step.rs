@@ -44,15 +44,16 @@ pub fn nearest_step_number(size: f64) -> i32 {
     ((8.0 * size.log2()).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }
 
-/// Number of intervals into which [`PredictedMultiple::offset`] divides a quantization step.
+/// Number of possible values of [`PredictedMultiple::offset`], which says where between two quantized values a
+/// predicted value lies.
 pub(super) const OFFSETS: usize = 8;
 
 /// Multiple of a quantization step that is nearest to a predicted value, and the offset of the value from it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PredictedMultiple {
     pub(super) multiple: i64,
-    /// Eighth of a step in which the predicted value lies: 0 begins half a step below the multiple, 7 ends half a step
-    /// above it.
+    /// Position of the predicted value relative to `multiple`, in eighths of a step: the step from half a step below
+    /// the multiple to half a step above it is divided into intervals 0 to 7, and this is the index of the interval.
     pub(super) offset: usize,
 }
 
@@ -88,7 +89,8 @@ impl QuantizationGrid {
         (value * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE)
     }
 
-    /// Returns the multiple nearest to the predicted value `value`, and how far the value is from it.
+    /// Returns the multiple of the quantization step that is nearest to the predicted value `value`, and the offset of
+    /// the value from this multiple.
     #[inline(always)]
     pub(super) fn predicted(self, value: f32) -> PredictedMultiple {
         let x = self.clamped(f64::from(value));

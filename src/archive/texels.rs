@@ -8,16 +8,15 @@ use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, texel_pair};
 use crate::model::AttributeValues;
 
-/// Exponent of class 0. The exponent of a texel is the floor of log2 of its squared interpolation weights, summed over
-/// the Gaussians that read it. Texels with a smaller exponent also belong to class 0.
+/// Smallest octave of a texel that has a class of its own; texels of smaller octaves belong to class 0 too. The octave
+/// of a texel is log2, rounded down, of its squared interpolation weights, summed over the Gaussians that read it.
 const MIN_EXPONENT: i32 = -8;
-/// Number of classes of texels. A class holds the texels of one octave of the sum of squared interpolation weights,
-/// taken over the Gaussians that read the texel; it selects their quantization grid.
+/// Number of classes of texels. A class is a number that selects a texel's quantization grid. Texels belong to the same
+/// class if their squared interpolation weights, summed over the Gaussians that read them, lie in the same octave.
 pub(super) const CLASSES: usize = 16;
 
-/// Returns the octave that belongs to the texel class `class`: log2, rounded down, of the squared interpolation weights
-/// with which Gaussians read the texel, summed over these Gaussians. A texel that is read once with weight 1 has octave
-/// 0.
+/// Returns the octave of the texels in the class `class`: log2, rounded down, of the sum of a texel's squared
+/// interpolation weights over the Gaussians that read it. A texel that one Gaussian reads with weight 1 has octave 0.
 pub(super) fn octaves(class: u8) -> i32 {
     i32::from(class) + MIN_EXPONENT
 }
@@ -63,8 +62,8 @@ pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis:
     squared_weights.into_iter().map(class).collect()
 }
 
-/// Returns the range of rows that a plane over time needs for times from `first` to `last`. Rows are times; the plane
-/// has `size` of them.
+/// Returns the range of rows of a feature plane that interpolation reads for times from `first` to `last`. The plane
+/// has time along its `size` rows; row 0 is the time −1, the last row is the time 1.
 pub(super) fn time_rows(first: f32, last: f32, size: usize) -> std::ops::Range<usize> {
     let (first, last) = (texel_pair(first, size), texel_pair(last, size));
     let end = if last.fraction > 0.0 { last.high } else { last.low };

@@ -41,8 +41,8 @@ impl CacheDir {
         }
     }
 
-    /// Makes all cache keys that are created from now on depend on `context`, in addition to the values they already
-    /// depend on.
+    /// Makes the keys of all entries that are read or written from now on depend on `context` too. `context` is the key
+    /// of something that all these results depend on, such as the input or the views.
     pub(super) fn depend_on(&mut self, context: CacheKey) {
         self.context = self.context.extended_by(&context);
     }

@@ -188,8 +188,8 @@ impl EntryHeader {
 }
 
 impl CacheEntry {
-    /// Opens the cache entry at `path` and verifies the hash of all its bytes. If the entry is damaged or its key is
-    /// not `key`, returns the reason as inner `Err`.
+    /// Opens the cache entry at `path` and verifies the hash of all its bytes. Fails if the file cannot be read. If it
+    /// is damaged or its key is not `key`, returns `Ok(Err(reason))`.
     ///
     /// Reads the file without a memory map, which for a large entry would count as memory of this process.
     pub(super) fn open(path: &Path, key: &str) -> Result<std::result::Result<CacheEntry, String>> {

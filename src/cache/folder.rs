@@ -64,7 +64,8 @@ pub fn list_results(folder: &Path) -> Result<Vec<StoredResult>> {
     Ok(found)
 }
 
-/// Formats `listed`, the stored results of a work folder, for display.
+/// Formats `listed`, the stored results of a work folder, as text for the terminal: a line for each input that results
+/// belong to, and below it one line per result.
 pub fn format_list(listed: &[StoredResult]) -> String {
     let mut out = String::new();
     for run_entries in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {

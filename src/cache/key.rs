@@ -21,7 +21,7 @@ impl CacheKey {
         CacheKey(Some(hash.0.digest128()))
     }
 
-    /// Returns the key that depends on everything that this key depends on, and on `value`.
+    /// Returns the key of a result that depends on `value` in addition to everything that this key stands for.
     pub fn extended_by(self, value: &impl Serialize) -> CacheKey {
         self.0.map_or(CacheKey::NONE, |before| CacheKey::new(&(before, CacheKey::new(value))))
     }

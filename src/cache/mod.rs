@@ -72,8 +72,8 @@ impl Cache {
         Ok(Cache { dir: Some(CacheDir::open_or_create(&asked.folder, about)?), part: asked.part, ..Cache::default() })
     }
 
-    /// Makes all cache keys that are created from now on depend on `context`, in addition to the values they already
-    /// depend on.
+    /// Makes the keys of all entries that are read or written from now on depend on `context` too. `context` is the key
+    /// of something that all these results depend on, such as the input or the views.
     pub fn depend_on(&mut self, context: CacheKey) {
         if let Some(dir) = &mut self.dir {
             dir.depend_on(context);
@@ -128,9 +128,10 @@ impl Cache {
         self.write_shard(stage, key, Shard::WHOLE, found)
     }
 
-    /// Returns the result of `stage` for `key` if it is stored. Otherwise computes it with `compute` and stores it.
-    /// `stage` is not divided into shards (parts), so a run that is limited to one shard does the same. To end such a
-    /// run instead, `compute` calls [`Cache::end_shard_run_before`].
+    /// Returns the result of `stage` for `key` if it is stored. If it is not, computes it with `compute` and stores it.
+    ///
+    /// `stage` cannot be divided into shards (parts), so a run that is limited to one shard computes it as any other
+    /// run does. If such a run must end before this stage, `compute` calls [`Cache::end_shard_run_before`] first.
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -148,8 +149,9 @@ impl Cache {
         Ok(found)
     }
 
-    /// Ends the run with an error if it is limited to one shard (part of a divided stage). Otherwise does nothing. To
-    /// be called before `stage`, which cannot be divided.
+    /// Ends a run that is limited to one shard (part of a divided stage), by returning an error; does nothing in any
+    /// other run. To be called before `stage`, a stage that cannot be divided: it has no shard that such a run could
+    /// compute.
     ///
     /// # Errors
     /// Fails with [`Error::ShardDone`] if the run is limited to one shard.
@@ -162,9 +164,10 @@ impl Cache {
         }
     }
 
-    /// Returns the result of `stage` for `key`, which is computed in shards (ranges of its `units` units of work).
-    /// Other runs may have computed some of the shards. `compute` returns the result of a range; `join` combines the
-    /// results of all ranges in order. The combined result must not depend on how the units are divided.
+    /// Returns the result of `stage` for `key`. The work of the stage consists of `units` units, such as views. It is
+    /// divided into shards, each a range of consecutive units, some of which other runs may have computed and stored.
+    /// `compute` returns the result of a range; `join` combines the results of all ranges, in order. The combined
+    /// result must not depend on how the units are divided.
     ///
     /// # Errors
     /// Fails if `compute` or `join` fails or the folder cannot be used. A run that is limited to one shard ends with
@@ -195,10 +198,10 @@ impl Cache {
         self.complete(stage, whole)
     }
 
-    /// Computes the result of `stage` for `key` in shards, as [`Cache::compute_in_shards`] does, but leaves it on disk.
-    /// `write` writes the result of a range of units of work. Without a work folder, the result goes to a scratch file
-    /// in the folder `scratch`. For each shard, returns the range of its units, and the file content that holds their
-    /// result.
+    /// Computes the result of `stage` for `key` in shards (ranges of its `units` units of work), but leaves it on disk.
+    /// Returns for each shard the range of its units, and a [`Spill`] from which its result can be read. `write`
+    /// computes the result of a range and writes it to the given writer. Without a work folder, the result goes to a
+    /// scratch file in the folder `scratch`.
     ///
     /// # Errors
     /// Fails where [`Cache::compute_in_shards`] fails.
@@ -231,8 +234,9 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`. Fails with [`Error::ShardDone`] instead if the run is limited to
-    /// shard 1 of 1: this shard is the whole stage, and such a run ends when its shard is done.
+    /// Passes `whole`, the full result of `stage`, on to the caller, except in a run that is limited to shard (part of
+    /// the stage) 1 of 1. This shard is the whole stage and such a run ends when its shard is done, so it fails with
+    /// [`Error::ShardDone`].
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -242,17 +246,17 @@ impl Cache {
         }
     }
 
-    /// Returns the number n of shards (parts) into which `stage` is divided; 1 if it is not divided. To be called if
-    /// the full result of `stage` is not stored. The caller then computes those of the n shards that are not stored,
-    /// and joins all n.
+    /// Decides into how many shards (parts) `stage` is divided, and returns this number n; 1 means that it is not
+    /// divided. To be called if the full result of `stage` is not stored. The caller then computes the shards that are
+    /// not stored, and joins all n.
     ///
     /// - Without a work folder, n is 1.
-    /// - If all shards of one division are stored, n is their number.
-    /// - Otherwise, if the run is not limited to a shard, n is the number of shards of the stored division that is most
-    ///   complete, or 1 if no shard is stored.
+    /// - Otherwise, if all shards of a division are stored, n is the number of its shards.
+    /// - Otherwise, if the run is not limited to a shard: n is the number of shards of the division of which the
+    ///   largest fraction is stored, or 1 if no shard is stored.
     /// - Otherwise, if the run is limited to shard 1 of 1, n is 1.
-    /// - Otherwise, this function computes and stores the requested shard with `make`, unless `find` finds it stored,
-    ///   and fails with [`Error::ShardDone`].
+    /// - Otherwise the run is limited to one shard of several. Computes and stores the shard with `make` if `find` does
+    ///   not find it stored. Then returns the error [`Error::ShardDone`], which ends the run.
     fn divide<T>(
         &self,
         stage: &str,

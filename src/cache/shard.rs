@@ -20,8 +20,9 @@ pub enum Completion<T> {
 }
 
 impl<T> Completion<T> {
-    /// Converts the result of a run: success becomes [`Completion::Whole`], and the error [`Error::ShardDone`], with
-    /// which a run that is limited to one shard (part of a divided stage) ends, becomes [`Completion::Shard`].
+    /// Converts the result of a run that may be limited to one shard (part of a divided stage):
+    /// - Success becomes [`Completion::Whole`].
+    /// - [`Error::ShardDone`], with which a limited run ends, becomes [`Completion::Shard`].
     ///
     /// # Errors
     /// Fails if `result` is any other error.
@@ -34,7 +35,7 @@ impl<T> Completion<T> {
     }
 }
 
-/// Shard (part of a divided stage) number `index`, counted from 1, of `count` shards.
+/// One of the `count` shards (parts) into which the work of a stage is divided. `index` is its number, counted from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     index: usize,
@@ -42,7 +43,7 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Shard 1 of 1, which contains all the work.
+    /// Shard (part of a divided stage) 1 of 1, which contains all the work of the stage.
     pub(super) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
     /// Returns all `count` shards (parts) of a divided stage, in order.
@@ -55,7 +56,7 @@ impl Shard {
         (self.index, self.count)
     }
 
-    /// Returns the range of a stage's units of work, 0 to `units`, that belongs to this shard.
+    /// Returns the range of a stage's units of work, 0 to `units`, that belongs to this shard (part of the stage).
     pub(super) fn unit_range(self, units: usize) -> Range<usize> {
         let end = |shards: usize| (units as u128 * shards as u128 / self.count as u128) as usize;
         end(self.index - 1)..end(self.index)

@@ -15,7 +15,7 @@ use crate::files::atomic::{Replace, StagedFile};
 /// Number of bytes that this process has read back from all [`Spill`]s so far.
 static READ_BACK: AtomicU64 = AtomicU64::new(0);
 
-/// Data on disk that is written once. Any part of it can then be read, in any order.
+/// Data that was moved from memory to a file. Any range of its bytes can be read, in any order.
 #[derive(Debug)]
 pub struct Spill {
     file: File,
@@ -23,7 +23,7 @@ pub struct Spill {
     path: PathBuf,
 }
 
-/// Writer of a [`Spill`] (data on disk that is written once and read in pieces).
+/// Writer of a [`Spill`], that is, of data that is moved from memory to a file.
 pub struct SpillWriter {
     writer: EntryWriter,
     /// Path shown in error messages: the path of the file itself or, for an unnamed file, of its folder.
@@ -48,8 +48,8 @@ impl Spill {
         read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.path))
     }
 
-    /// Reads the record at byte `start`, written by [`SpillWriter::write_record`], into `bytes`. Returns the start of
-    /// the next record.
+    /// Reads the record (length and bytes of one value, written by [`SpillWriter::write_record`]) at byte `start` of
+    /// the content. Stores its bytes in `bytes`, and returns the start of the next record.
     ///
     /// # Errors
     /// Fails where [`Spill::read`] fails.
@@ -79,8 +79,8 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: folder.to_owned(), staged: None })
     }
 
-    /// Creates the writer of a cache entry that gets the path `target` when it is complete. `key` is its cache key,
-    /// `about` the description of its input.
+    /// Creates the writer of a cache entry. Its file gets the path `target` when it is complete. `key`: cache key of
+    /// the entry. `about`: description of the input, which is stored in the entry.
     pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<SpillWriter> {
         let staged = StagedFile::new(target, Replace::Existing)?;
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
@@ -104,7 +104,8 @@ impl SpillWriter {
         self.writer.write_all(bytes).map_err(failed)
     }
 
-    /// Appends the length of `bytes` as 8 bytes, then `bytes`, to the content.
+    /// Appends `bytes` to the content as a record that [`Spill::read_record`] can read: first their number as 8 bytes,
+    /// then the bytes.
     ///
     /// # Errors
     /// Fails if the write fails.
@@ -120,7 +121,8 @@ impl SpillWriter {
         Err(Error::io(self.write_action(), &self.path)(failed))
     }
 
-    /// Completes the file and gives it its final name, unless it is unnamed. Returns the content for reading.
+    /// Completes the file and returns its content for reading. The file of a cache entry gets its final name; a scratch
+    /// file has none.
     ///
     /// # Errors
     /// Fails if a write fails.

@@ -11,8 +11,9 @@ fn open_cache(folder: &Path, part: Option<&str>) -> Cache {
     Cache::open(&request(folder, part), "a test".to_owned()).unwrap()
 }
 
-/// Computes the squares of the first `units` numbers in shards. Returns the result of the stage, and the units that
-/// this call computed.
+/// Runs a stage that computes the squares of the numbers from 0 to `units` − 1, in shards (parts of the numbers), with
+/// the cache `work`. Returns the result of the stage, and the numbers whose squares this call computed because they
+/// were not in the cache.
 fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
     let computed = RefCell::new(Vec::new());
     let compute = |some: Range<usize>| {

@@ -31,14 +31,15 @@ Examples:
   splatsieve convert small.gsz small                 the model folder in it
 `splatsieve COMMAND -h` prints examples and common options, `--help` all options.";
 
-/// Groups of commands in the help of the program.
+/// Groups of commands in the help of the program: the heading of each group, and the names of its commands.
 const GROUPS: [(&str, &[&str]); 3] = [
     ("Everyday", &["compress", "evaluate", "report", "view", "render", "convert", "info"]),
     ("Study", &["score", "sweep", "precision"]),
     ("Other", &["demo", "cache", "recipe", "selfcheck", "completions", "man"]),
 ];
 
-/// Examples of every command. Two spaces separate a command line from its explanation.
+/// Examples in the help of each command: the name of the command, and one line of text per example. In a line, two
+/// spaces separate the command line from its explanation.
 const COMMAND_EXAMPLES: &[(&str, &[&str])] = &[
     (
         "compress",

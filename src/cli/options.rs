@@ -385,7 +385,7 @@ pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
 }
 
 /// Returns the library's memory settings: the memory limit, and whether the memory plan is printed. If a limit is
-/// given, the process returns freed memory to the system from this call on.
+/// given, also makes the allocator return freed memory to the system at once, where it can.
 fn memory_budget(memory: Memory) -> Budget {
     if memory.memory.is_some() {
         return_freed_memory();
@@ -404,8 +404,9 @@ fn conventions(trained: &Trained) -> TrainingConventions {
     TrainingConventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
 }
 
-/// Returns the library's options for opening an input. Temporary files go to the folder that `--scratch-dir` names.
-/// Without this option, they go beside `output`. If `cameras` is `None`, the cameras and the split keep their defaults.
+/// Returns the library's options for opening an input. If `cameras` is `None`, cameras and split keep their defaults.
+/// Temporary files go to the folder that `--scratch-dir` names. Without this option, they go to the folder that
+/// contains `output`, or to the system's folder for temporary files if `output` is `None`.
 pub(super) fn input_options(
     input: Input,
     cameras: Option<Cameras>,

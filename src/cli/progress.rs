@@ -1,6 +1,6 @@
-//! Progress on standard error. On a terminal, every task has a bar with rate and time left; nested tasks have bars
-//! below it. In a log, a task prints a line when it ends and at most one line per minute before; a nested task prints
-//! none when it ends.
+//! Progress on standard error. On a terminal, every task has a bar with rate and time left; the bar of a nested task (a
+//! task that runs within another) is below it. In a log, a task prints at most one line per minute while it runs, and
+//! one line when it ends; a nested task prints none at its end.
 //!
 //! A line wider than the terminal would not be erased completely when it is redrawn. Therefore lines are composed from
 //! the parts that fit.
@@ -40,7 +40,7 @@ pub(super) struct Display {
 struct Shared {
     /// Bars of all running tasks; the bar of a nested task is below that of the outer task.
     bars: MultiProgress,
-    /// Number of running tasks whose progress is written as log lines.
+    /// Number of tasks that are running and whose progress is written as log lines, not shown as a bar.
     logs: AtomicUsize,
     /// Stages, start and running stage of the current run; `None` outside a run.
     run: Mutex<Option<RunPosition>>,
@@ -161,8 +161,8 @@ struct RunPosition {
 }
 
 impl RunPosition {
-    /// Notes that the task `name` begins at the time `now`. If it is a stage of the run, marks it as running and
-    /// returns its label `[k/n] name`. Otherwise returns `name` unchanged.
+    /// Returns the label of the task `name`, which begins at the time `now`. If the task is a stage of the run, records
+    /// it as the running stage, and the label is `[k/n] name`: stage k of n. For any other task the label is `name`.
     fn enter(&mut self, name: &str, now: Instant) -> String {
         let Some(place) = self.stages.iter().position(|(stage, _)| *stage == name) else { return name.to_owned() };
         if self.current.is_none_or(|(stage, _)| stage != place) {
@@ -171,12 +171,13 @@ impl RunPosition {
         format!("[{}/{}] {name}", place + 1, self.stages.len())
     }
 
-    /// Returns the estimated time from `now` until the end of the run, seconds. `step`: estimated time, in seconds,
-    /// until the end of the current task.
+    /// Returns the estimated time from `now` until the end of the run, seconds. `step`: estimated time until the end of
+    /// the current task, seconds.
     /// - Before the first stage, returns `step`.
-    /// - Otherwise, returns the time left of the current stage, but at least `step`, plus the expected times of the
-    ///   later stages. Expected times are multiplied by the ratio of actual to expected time of the earlier stages,
-    ///   limited to 0.1 to 10. The factor is 1 if less than half a second was expected for the earlier stages.
+    /// - Later, returns the time left of the current stage, but at least `step`, plus the expected times of the stages
+    ///   after it. If the earlier stages took longer or shorter than expected, all expected times are scaled by the
+    ///   same ratio, limited to 0.1 to 10. They are not scaled if less than half a second was expected for the earlier
+    ///   stages.
     fn left(&self, step: f64, now: Instant) -> f64 {
         let Some((place, since)) = self.current else { return step };
         let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
@@ -205,8 +206,8 @@ struct BarSnapshot<'a> {
 }
 
 impl<'a> BarSnapshot<'a> {
-    /// Returns the data that the bar of the task `name` shows. `state`: progress of the task, counted in `unit`. `run`:
-    /// progress of the run, if the task is one of its stages.
+    /// Returns the data that a progress bar shows about the task `name`. `state`: progress of the task, counted in
+    /// `unit`. `run`: progress of the run, if the task is a stage of it; `None` for any other task.
     fn new(state: &ProgressState, name: &'a str, run: Option<&RunPosition>, unit: &'a str) -> BarSnapshot<'a> {
         let (done, total) = (state.pos(), state.len());
         // The rate is unknown before the first unit is done.

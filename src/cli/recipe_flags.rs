@@ -20,7 +20,7 @@ const MAX_RECIPE_BYTES: u64 = 1 << 20;
 /// Key of the list of merge passes, the only parameter whose value is not a single number or word.
 const PASSES: &str = "passes";
 
-/// Change of the recipe that one option `--set KEY=VALUE` requests.
+/// Change of the recipe by one option `--set KEY=VALUE`.
 #[derive(Debug, Clone, PartialEq)]
 enum RecipeSetting {
     /// New value, as text, of the parameter `key` in the section `section` of the recipe.

@@ -192,7 +192,7 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     })
 }
 
-/// Runs the command `view`, which writes the page of the player. Prints its path and its size.
+/// Runs the command `view`, which writes a page that plays a model. Prints the path and the size of the page.
 fn run_view(args: ViewArgs, events: &Events) -> Result<()> {
     let as_json = args.json;
     let found = view::view(&view_options(args, events))?;
@@ -203,7 +203,8 @@ fn run_view(args: ViewArgs, events: &Events) -> Result<()> {
     print_result(as_json, &value, &found.notes, || page_text(&found) + "\n")
 }
 
-/// Writes the HTML page that plays a model, and its notes to standard error. Returns the text about the page.
+/// Writes the HTML page that plays a model, and prints notes about it to standard error. Returns a line of text with
+/// the path and the size of the page.
 fn write_page(options: &ViewOptions) -> Result<String> {
     let found = view::view(options)?;
     tell_notes(&found.notes);

@@ -39,11 +39,12 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Writes the model in the archive at `path` to `output` in the form in which it was archived: as a model folder or a
-/// single file. Returns `None` and writes nothing if this form does not match `kind`, the requested kind of output. An
-/// archive that holds the file layout of its model format matches only the kind of this layout; any other archive
-/// matches a model folder and a PLY. If there is no match, the caller then opens the archive as an input and converts
-/// it.
+/// Restores the model in the archive at `path` in the form that it had before: a model folder or a single file, at the
+/// path `output`. Returns `None` and writes nothing if `kind`, the requested kind of output, is not this form:
+/// - An archive that states the file layout of its model format has the kind of this layout.
+/// - Any other archive holds a model folder or a PLY; `kind` must be one of these two.
+///
+/// After `None`, the caller opens the archive as an input and converts it.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.

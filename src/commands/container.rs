@@ -52,8 +52,9 @@ pub enum StoragePrecision {
 }
 
 impl StoragePrecision {
-    /// Returns the packing (compression and error bounds) that this precision requests. Calls `extent`, which returns
-    /// the extent of the scene in scene units, only if an error bound is relative to it.
+    /// Returns the packing of a container, that is, its compression and the error bound of each attribute. `extent`
+    /// returns the extent of the scene in scene units; it is called only if an error bound is given relative to the
+    /// extent.
     fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
         match self {
             StoragePrecision::Exact(compression) => Ok((*compression).into()),
@@ -158,8 +159,8 @@ fn pack_arriving(
     Ok(packed(output, gaussians, frames, bytes, larger, Vec::new()))
 }
 
-/// Returns the report on the packed container with the path `output`. `bytes`: size of the container. `larger`: reason
-/// why the container is larger than the input, if it is.
+/// Returns the report on the container at the path `output`, which was just written. `bytes`: size of the container.
+/// `larger`: if the container is larger than the input, the reason for this.
 fn packed(
     output: &Path,
     gaussians: usize,

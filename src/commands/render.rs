@@ -186,8 +186,8 @@ impl RenderJob<'_> {
         self.for_each_view(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
     }
 
-    /// Renders the views `pictures`, encodes each render as an image file, and writes the bytes of these files to the
-    /// temporary data `to`, one record per view, in order.
+    /// Renders the views `pictures`, encodes each render as an image file, and writes the files to the temporary data
+    /// `to` instead of the output folder: one record (length and bytes) per view, in order.
     fn spill(&self, pictures: &[FrameView], to: &mut SpillWriter) -> Result<()> {
         let encode = |picture: FrameView, image: &Image| {
             let named = PathBuf::from(format!("{}.{}", picture.name(), self.format.extension()));
@@ -196,8 +196,8 @@ impl RenderJob<'_> {
         self.for_each_view(pictures, encode, |bytes| to.write_record(&bytes))
     }
 
-    /// Renders the views `pictures`. Calls `render_one` with each view and its finished render, from any thread. Passes
-    /// the values that `render_one` returns to `take`, in the order of the views.
+    /// Renders the views `pictures` in batches. Calls `render_one` with each view and its finished render, on any
+    /// thread. After each batch, calls `take` with each value that `render_one` returned, in the order of the views.
     fn for_each_view<T: Send>(
         &self,
         pictures: &[FrameView],
@@ -223,8 +223,8 @@ impl RenderJob<'_> {
     }
 }
 
-/// Copies the image files of the views `pictures` from `spill`, to which [`RenderJob::spill`] wrote them, to the paths
-/// that `path` returns for the views.
+/// Copies image files from the temporary data `spill` to files of their own. [`RenderJob::spill`] wrote them, one per
+/// view of `pictures`, in order. `path` returns the path of the file for a view.
 fn write_spilled(pictures: &[FrameView], spill: &Spill, path: impl Fn(&FrameView) -> PathBuf) -> Result<()> {
     let (mut at, mut bytes) = (0, Vec::new());
     for picture in pictures {

@@ -123,10 +123,9 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
 }
 
-/// Removes the times from the shots (views of the scene) of `opened`, so that every camera can show every frame.
-/// Returns a copy of the original shots, with their times. Does nothing and returns `None` in two cases:
-/// - There are no cameras.
-/// - `has_other_frames` is false: the frames are at the times of the cameras.
+/// Removes the times from the views of `opened` (shots: pairs of a camera and a time), so that every camera can show
+/// every frame. Returns a copy of the views with their times. Does nothing and returns `None` if there are no cameras,
+/// or if `has_other_frames` is false, that is, if the frames are at the times of the cameras.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();
@@ -134,8 +133,8 @@ fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<
     Some(own)
 }
 
-/// Returns those shots (views of the scene) in `all` that belong to the set `views`, sorted by view number, then time;
-/// shots without a time come first. Fails if there are none.
+/// Returns those shots (pairs of a camera and a time) in `all` that belong to the set `views`, sorted by view number,
+/// then time; shots without a time come first. Fails if there are none.
 fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     let split = views.split(rig);
     let mut found: Vec<Shot> =
@@ -150,8 +149,10 @@ fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     }
 }
 
-/// Returns the cameras of the video, and for each video frame, in order, the frame of the model and the camera to
-/// render.
+/// Plans a video. Returns its cameras and, for each image of the video in order, the frame of the model and the index
+/// of the camera. `times`: times of the frames.
+/// - For one view: one image per frame, from the camera of this view whose time is nearest.
+/// - For a path: new cameras that move through the cameras of its views.
 fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
     match path {
         VideoCamera::View(view) => {
@@ -186,8 +187,8 @@ fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> R
     }
 }
 
-/// Returns the shots (views of the scene) with the view number `view`. `shots` must be sorted by view number. Fails if
-/// there is no such shot; the message names the command line option `flag`.
+/// Returns the shots (pairs of a camera and a time) with the view number `view`. `shots` must be sorted by view number.
+/// Fails if there is no such shot; the message names the command line option `flag`.
 fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
     let mut views = shots.chunk_by(|a, b| a.view == b.view);
     views.find(|shots| shots[0].view == view).ok_or_else(|| {

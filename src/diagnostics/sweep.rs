@@ -132,8 +132,9 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     Ok(found)
 }
 
-/// Opens the input. Returns the result of the sweep, which has no measured points yet, and the file name for outputs of
-/// the same kind as the input.
+/// Opens the input. Returns two values:
+/// - a result of the sweep that describes the input and has no measured points yet
+/// - the file name for the results of the runs, which are of the same kind as the input (container or not)
 fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&with_training_views(&options.input))?;
     let name = result_name(&scene)?;
@@ -161,16 +162,17 @@ fn merge_only_count(found: &TradeOff) -> Option<usize> {
     found.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
-/// Returns whether `method` is merging without pruning and cannot reach `fraction`, because merging alone leaves more
-/// Gaussians. This is known from the points measured so far, in `found`.
+/// Returns whether a run of `method` with the kept fraction `fraction` cannot succeed: the method is merging without
+/// pruning, and the points in `found` show that merging alone leaves more Gaussians than this fraction. Such a run is
+/// skipped.
 fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {
     let wanted = fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
     wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// Measures and returns one point of the trade-off curves by running `method`, whose recipe or baseline is
-/// `method_kind`. `fraction`: fraction of the Gaussians to keep; `None`: the method chooses their number. Also sets the
-/// number of compared views in `found`.
+/// Measures one point of the trade-off curves by complete runs of `method`, and returns it. `method_kind`: recipe or
+/// baseline that implements `method`. `fraction`: fraction of the Gaussians to keep; `None`: the method chooses their
+/// number. Also stores the number of compared views in `found`.
 fn measure(
     run: &WholeRun<'_>,
     method: Method,

@@ -50,9 +50,12 @@ pub struct TestSceneOptions {
 pub struct TestSceneReport {
     /// Summary of the compression.
     pub summary: Summary,
-    /// One entry per body (object of the test scene): the body, its number of Gaussians, the number of its Gaussians
-    /// that were kept (unmerged, or as the first member of a merged group), and the number of its Gaussians that were
-    /// merged into others. All other Gaussians of the body were pruned.
+    /// One entry per body (object of the test scene). All Gaussians of a body that are in neither of the last two
+    /// numbers were pruned. The elements are:
+    /// - the body
+    /// - the number of its Gaussians
+    /// - how many of them were kept: unmerged, or as the first member of a merged group
+    /// - how many of them were merged into other Gaussians
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 

@@ -1,5 +1,5 @@
-//! Complete run of the program as a user starts it, from opening the input to a result on disk, with measurement of its
-//! cost and of the quality of its result.
+//! Runs the whole program as a user does, from opening the input to a result on disk, and measures run time, memory and
+//! the quality of the result. Used by the commands `sweep` and `precision`.
 
 use std::fs;
 use std::path::Path;
@@ -26,7 +26,7 @@ pub(crate) struct WholeRun<'a> {
     pub(crate) scratch: &'a Path,
     /// File name of the result, which determines the output format.
     pub(crate) name: &'a str,
-    /// Limits on how often a run is repeated to measure its time.
+    /// Maximum number and maximum total time of the runs by which the time of one setting is measured.
     pub(crate) repeats: RepeatLimits,
     /// Maximum number of frames at which the result is compared with the original, evenly spaced; `None`: all frames.
     pub(crate) max_frames: Option<usize>,
@@ -35,10 +35,11 @@ pub(crate) struct WholeRun<'a> {
 }
 
 impl WholeRun<'_> {
-    /// Compresses the input by the recipe or baseline `method_kind`, as often as `repeats` allows, and measures time
-    /// and memory. `target`: number or fraction of the Gaussians to keep; `None`: `method_kind` decides. Then calls
-    /// `inspect` with the path of the last result, and deletes this result. Returns the value of `inspect` and the cost
-    /// of the compression.
+    /// Compresses the input and measures time and memory. If [`WholeRun::repeats`] allows more than one run, compresses
+    /// it several times. Then calls `inspect` with the path of the last result, and deletes this result. Returns the
+    /// value of `inspect` and the cost (time and memory) of the compression.
+    /// - `method_kind`: recipe or baseline by which the input is compressed
+    /// - `target`: number or fraction of the Gaussians to keep; `None`: `method_kind` decides
     ///
     /// # Errors
     /// Returns the errors of `compress` and of `inspect`.

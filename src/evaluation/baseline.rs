@@ -1,5 +1,6 @@
-//! Static baselines of the literature: pruning by one property of the Gaussians at one frame, without regard to time or
-//! visibility (the paper's "opacity/scale thresholds"), and pruning at random.
+//! Static baselines of the literature, to which the methods of this project are compared. A baseline prunes the
+//! Gaussians by one property at one frame, without regard to time or visibility (the paper's "opacity/scale
+//! thresholds"), or at random.
 
 use std::path::Path;
 
@@ -15,8 +16,8 @@ use crate::pipeline::stages::write::write_without_companions;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_scene};
 
-/// Property by which a baseline ranks the Gaussians. It keeps the Gaussians with the largest values; ties are ordered
-/// by a hash of the id.
+/// Pruning baseline, named after the property by which it ranks the Gaussians. A baseline keeps the Gaussians with the
+/// largest values; ties are ordered by a hash of the id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Baseline {
     /// Ranking by opacity, largest first.
@@ -51,8 +52,8 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     write_without_companions(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
 }
 
-/// Returns the `target_count` ids in `ids` with the largest values of the property by which `baseline` ranks, in
-/// increasing order. Row i of `state` holds the attributes of the Gaussian with the id i.
+/// Returns the `target_count` ids out of `ids` that `baseline` keeps: those of the Gaussians with the largest values of
+/// its property. The returned ids increase. Row i of `state` holds the attributes of the Gaussian with the id i.
 fn largest(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, target_count: usize) -> Vec<u32> {
     let value = |id: u32| -> f32 {
         let row = id as usize;

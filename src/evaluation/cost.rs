@@ -64,8 +64,9 @@ impl RepeatLimits {
         RepeatLimits { most, max_total_seconds: f64::INFINITY }
     }
 
-    /// Runs `work` repeatedly within these limits. Returns the value of the last run, and the cost of the runs. Calls
-    /// `clear` between two runs; its time is not measured.
+    /// Runs `work` repeatedly within these limits and measures each run. Calls `clear` between two runs, for example to
+    /// delete what a run wrote; the time of `clear` is not measured. Returns the value of the last run, and the cost
+    /// (time and memory) of all runs.
     ///
     /// # Errors
     /// Fails if `work` or `clear` fails.

@@ -111,8 +111,9 @@ impl Method {
     }
 }
 
-/// Recipe or baseline by which a method compresses. The second field of [`MethodKind::Recipe`] states which stages run:
-/// pruning, merging or both.
+/// Recipe or baseline by which a method compresses:
+/// - `Recipe`: a recipe, with the stages that run (pruning, merging or both).
+/// - `Baseline`: a baseline, which only prunes by one property of the Gaussians.
 pub(crate) enum MethodKind {
     Recipe(Box<Recipe>, PruneOrMerge),
     Baseline(Baseline),

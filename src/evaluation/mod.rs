@@ -1,10 +1,15 @@
-//! Evaluation: compares renders of the original and the compressed model with each other and with photographs.
+//! Evaluation: compares renders of the compressed model with renders of the original and, if there are any, both with
+//! photographs. [`ModelPair`] does the comparison, and [`Evaluation`] holds its result.
 //!
-//! Frames are read one by one. Memory holds one frame state of each model, and one render of each per thread. Memory
-//! also holds the last images of every view that occurs again at a later frame, to measure the temporal error (flicker
-//! between two frames of a view). These images take 12 bytes per pixel each. There are two per view (renders of both
-//! models), or three with photographs. A run can be limited to a shard, which is a range of the (frame, view) pairs. It
-//! first renders again, for each view in its range, the last image of this view before the range.
+//! Frames are read one by one. Memory holds:
+//! - one frame state of each model,
+//! - one render of each model per thread,
+//! - for the temporal error (flicker between two frames of a view), the last images of every view that occurs again at
+//!   a later frame. There are two images per view (renders of both models), or three with photographs. Each image takes
+//!   12 bytes per pixel.
+//!
+//! A run can be limited to a shard, which is a range of the (frame, view) pairs. For each view in its range, such a run
+//! first renders again the last image of this view before the range.
 
 pub mod baseline;
 pub mod cost;
@@ -100,8 +105,8 @@ fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     Ok(evaluation)
 }
 
-/// Returns the estimate of the memory and time for rendering and comparing two models. The number of Gaussians in
-/// `work` must be that of the larger model.
+/// Returns the resource estimate (memory, time, reads) of the stage that renders and compares two models, under the
+/// limits `limits`. `work` holds the sizes of the input; its number of Gaussians must be that of the larger model.
 pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
     let mut need = view_selection::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
@@ -121,9 +126,9 @@ impl EvaluateOptions {
     }
 }
 
-/// Original and compressed model, both open, with the views on which they are compared.
+/// Original and compressed model, both open, together with the views on which they are compared.
 pub struct ModelPair {
-    /// Original model with the cameras of all splits.
+    /// Original model with the cameras of all splits (training, validation, test).
     pub scene: Scene,
     compressed: Box<dyn InputModel>,
     /// Options with which the compressed model was opened.
@@ -210,9 +215,10 @@ impl ModelPair {
     }
 
     /// Compares all views and returns the evaluation, as [`ModelPair::evaluate`] does, but as the first stage of a
-    /// longer run. Such a run may be limited to one shard (part of a divided stage). If the cache has the scores of all
-    /// shards, this function then returns the evaluation, so that the run can go on to its next stage; otherwise it
-    /// fails with [`Error::ShardDone`].
+    /// longer run. It differs only if the run is limited to one shard (part of a divided stage):
+    /// - If the cache has the scores of all shards, it returns the evaluation, so that the run can go on to its next
+    ///   stage.
+    /// - If the cache lacks some, it ends with [`Error::ShardDone`] after it has stored the scores of its own shard.
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -262,8 +268,8 @@ impl ModelPair {
         })
     }
 
-    /// Computes one value per view, as the stage `name`, which can be divided into shards (ranges of views). `compute`
-    /// returns the values of a range of views. Returns the values of all views in order.
+    /// Returns one value per view, in the order of the views. `compute` returns the values of the views in a range of
+    /// indices. The work is done as the stage `name`, which can be divided into shards (ranges of the views).
     fn compute_sharded<T: Serialize + DeserializeOwned>(
         &self,
         name: &str,
@@ -347,9 +353,9 @@ impl ModelPair {
         Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
-    /// Renders some views again and returns the values of `see` for them, sorted by the index of the view. `places`:
-    /// indices of these views in [`Evaluation::views`], in any order. Arguments of `see`: the index, the frame state of
-    /// the original, the camera, and the images of the view.
+    /// Renders the views with the indices `places` in [`Evaluation::views`] again, and calls `see` for each of them.
+    /// `places` may have any order. Arguments of `see`: the index, the frame state of the original, the camera, and the
+    /// images of the view. Returns the values of `see`, sorted by the index, with one value per different index.
     ///
     /// The comparison does not keep its renders for this purpose, because they would take memory that grows with the
     /// numbers of frames and views.
@@ -380,9 +386,9 @@ impl ModelPair {
         self.views[place]
     }
 
-    /// Renders `pictures` with both models and returns the values of `see` for them, in order. `see` gets the render of
-    /// the original, then that of the compressed model. `pictures` may be any views of the cameras of the scene, and
-    /// must be sorted by frame.
+    /// Renders the views `pictures` with both models and returns one value of `see` per view, in order. Arguments of
+    /// `see`: the render of the original, then that of the compressed model. `pictures` may be any views of the scene's
+    /// cameras, and must be sorted by frame.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or if `see` fails.
@@ -417,8 +423,8 @@ impl ModelPair {
         self.compressed.source().info().count
     }
 
-    /// Calls `visit` with batches of the views `pictures`, in order. A batch holds, for each of its views, the frame
-    /// states of the original and of the compressed model.
+    /// Calls `visit` for all views `pictures`, in order, with a batch of views at a time. For each view of a batch,
+    /// `visit` gets the frame states of the original and of the compressed model.
     fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all_gaussians);
         for_each_view_batch(
@@ -430,9 +436,10 @@ impl ModelPair {
         )
     }
 
-    /// Renders and compares the views in `range`. Returns the scores of these views and the values of `observe` for
-    /// them. The temporal error of a view needs the image of the same view at an earlier frame. Therefore the last
-    /// image before `range` is first rendered again, for every view in `range`.
+    /// Renders and compares the views with the indices `range`. Returns the scores of these views, and the values of
+    /// `observe` (arguments as in [`ModelPair::observe`]) for them. The temporal error of a view needs the image of the
+    /// same view at an earlier frame. Therefore, for every view in `range`, its last image before `range` is first
+    /// rendered again.
     fn scores<O: Send>(
         &self,
         range: Range<usize>,
@@ -498,9 +505,9 @@ impl ModelPair {
     }
 }
 
-/// Returns, for each view number in `range`, the last (frame, view) pair with this view number before the range. `all`:
-/// (frame, view) pairs of all images, sorted by frame. `range`: part of `all` that begins at the index `start`. The
-/// result has the order of `all`.
+/// Returns the views that must be rendered again before a range of views can be compared: for each view number in
+/// `range`, the last (frame, view) pair with this view number before the range. `all` has the pairs of all images,
+/// sorted by frame. `range` is the part of `all` that begins at the index `start`. The result has the order of `all`.
 fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
     let mut views: HashSet<u32> = range.iter().map(|picture| picture.view).collect();
     let mut last: Vec<FrameView> =

@@ -1,5 +1,5 @@
-//! Result of the command `precision` as JSON, text and CSV: run time and errors at every tried value of the settings of
-//! each stage.
+//! Result of the command `precision` as JSON, text and CSV. The command runs each stage with several values of one
+//! parameter, and measures run time and errors at each value.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -22,15 +22,16 @@ pub struct PrecisionDiagram {
     pub gaussians: usize,
     /// Number of frames of the input.
     pub frames: usize,
-    /// Number of frames that are used for scoring and ranking, spread evenly from first to last.
+    /// Number of frames whose views are used to score and rank Gaussians. They are spread evenly from the first frame
+    /// to the last.
     #[serde(rename = "frames_looked_at")]
     pub frames_scored: usize,
-    /// Number of views, at these frames, that are used for scoring and ranking.
+    /// Number of views that are used to score and rank Gaussians, over all [`PrecisionDiagram::frames_scored`] frames.
     pub pictures: usize,
-    /// Number of views on which the settings are judged: there, renders of their results are compared with renders of
-    /// the whole model. Test views are used if there are any.
+    /// Number of views on which settings are judged: in these views, renders of the Gaussians that a setting keeps are
+    /// compared with renders of the whole model. They are test views, if there are any.
     pub judged: usize,
-    /// File of the cameras, or description of the virtual rig.
+    /// File of the cameras, or description of the virtual rig (cameras that the program placed).
     pub cameras: String,
     /// Number of Gaussians that are kept with every setting.
     pub kept: usize,
@@ -92,7 +93,8 @@ pub struct PrecisionCurve {
     /// Description of the reference values from which the errors are measured.
     #[serde(rename = "against")]
     pub reference: String,
-    /// Measurements at each value of the parameter, in the order in which they were made; mostly from coarse to fine.
+    /// Measurements at each value of the parameter, in the order in which they were made. For most parameters this is
+    /// from coarse (fast, inaccurate) to fine (slow, accurate).
     #[serde(rename = "marks")]
     pub settings: Vec<PrecisionSetting>,
     /// Observed orders of the errors: the exponents with which the errors depend on the step size.
@@ -100,9 +102,9 @@ pub struct PrecisionCurve {
     /// Value that the recipe has for the parameter; `None` if this value was not measured.
     #[serde(rename = "own")]
     pub recipe_value: Option<f64>,
-    /// Coarsest sufficient value of the parameter; `None` if no value is sufficient. A value is sufficient if, at this
-    /// value and at all finer ones, the error added to renders stays below a tenth of the error of the compressed model
-    /// itself.
+    /// Coarsest sufficient value of the parameter; `None` if no value is sufficient. From a sufficient value on, up to
+    /// the finest value, the error added to renders stays below a tenth of the error of the compressed model itself.
+    /// The finest value does not count, because the errors are measured against it.
     #[serde(rename = "enough")]
     pub sufficient_value: Option<f64>,
 }
@@ -139,8 +141,9 @@ pub struct ObservedOrder {
 /// Name of the error: root mean square error of renders of the model that a setting yields, compared with renders of
 /// the whole model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
-/// Name of the error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the finest
-/// setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
+/// Name of the error √(e² − f²) / f. Here e is the error [`RENDER_ERROR`] of a setting, and f is that of the finest
+/// setting, which counts as the error of the compressed model itself. This is the error that the setting adds (see
+/// [`added_error`]).
 pub const ADDED_ERROR: &str = "added";
 /// Name of the error: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest
 /// setting keeps.
@@ -148,15 +151,15 @@ pub const KEPT_SET_JACCARD_DISTANCE: &str = "kept";
 /// Name of the error: relative error of the number of Gaussians that the thresholds of the recipe keep, compared with
 /// the finest setting.
 pub const KEPT_COUNT_ERROR: &str = "staying";
-/// Name of the error: largest relative error of the percentiles P1 and P99, compared with exact percentiles. Scores are
-/// normalized by these percentiles.
+/// Name of the error: largest relative error of the percentiles P1 and P99 by which the terms of the scores are
+/// normalized, compared with exact percentiles.
 pub const PERCENTILE_ERROR: &str = "percentiles";
 /// Name of the error: 1 if the result with a setting differs in any byte from the result with the first setting, else
 /// 0.
 pub const DIFFERENT_BYTES: &str = "bytes";
 
 /// Limit below which the error [`ADDED_ERROR`] counts as small. The error is below this limit at
-/// [`PrecisionCurve::sufficient_value`] and at all finer values.
+/// [`PrecisionCurve::sufficient_value`] and at all finer values of the parameter.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
 /// Returns the axis label of a diagram for the error with the name `error`.
@@ -174,9 +177,10 @@ pub fn axis_label(error: &str) -> String {
 
 impl PrecisionCurve {
     /// Creates the curve of the parameter `name` from its measurements `marks`, and computes the observed order of
-    /// every error. `against`: description of the reference values of the errors. `own`: value of the parameter in the
-    /// recipe. `expected`: orders of convergence that theory predicts, by the name of the error. Removes infinite
-    /// errors, which JSON cannot represent.
+    /// every error. Removes infinite errors, which JSON cannot represent.
+    /// - `against`: description of the reference values of the errors.
+    /// - `own`: value of the parameter in the recipe.
+    /// - `expected`: pairs of the name of an error and its order of convergence that theory predicts.
     pub fn new(
         name: &str,
         against: &str,
@@ -214,8 +218,8 @@ impl PrecisionCurve {
     }
 }
 
-/// Returns the least-squares slope of log error against log step size, over those `points` (step, error) whose step and
-/// error are above 0. Returns `None` if these are fewer than three or all have the same step.
+/// Returns the least-squares slope of log error against log step size. `points` are pairs (step, error), of which those
+/// with a step or an error of 0 are ignored. Returns `None` if fewer than three pairs remain or all have the same step.
 fn slope(points: impl Iterator<Item = (f64, f64)>) -> Option<f64> {
     let logs: Vec<(f64, f64)> = points
         .filter(|&(step, error)| step > 0.0 && error > 0.0)

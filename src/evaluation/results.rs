@@ -235,7 +235,8 @@ impl Comparison {
 
 impl InsideOutsideMeans {
     /// Averages the scores of the compressed model against the original, separately for views inside and outside the
-    /// rig. `is_outside` states for each of `views` whether it is outside. Returns `None` if no view is outside.
+    /// rig of the training cameras. `is_outside[i]` states whether the view `views[i]` is outside. Returns `None` if no
+    /// view is outside.
     pub fn from_views(views: &[ViewScores], is_outside: &[bool]) -> Option<InsideOutsideMeans> {
         let side = |outside: bool| -> Option<QualityMeans> {
             let chosen = views.iter().zip(is_outside).filter(|&(_, &is)| is == outside);

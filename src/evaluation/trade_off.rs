@@ -1,5 +1,5 @@
-//! Result of the command `sweep` as JSON, text and CSV: quality, size, time and memory of every method at every kept
-//! fraction, and of one method at several values of one parameter.
+//! Result of the command `sweep` as JSON, text and CSV. The command measures quality, size, time and memory of every
+//! method at every requested fraction of kept Gaussians, and of one method at several values of one parameter.
 
 use std::fmt::Write as _;
 
@@ -24,7 +24,7 @@ pub struct TradeOff {
     pub threads: usize,
     /// Number of (frame, view) pairs on which every result is compared with the original.
     pub pictures: usize,
-    /// File of the cameras, or description of the virtual rig.
+    /// File of the cameras, or description of the virtual rig (cameras that the program placed).
     pub cameras: String,
     /// Number of runs of every measurement.
     pub runs: usize,
@@ -74,12 +74,12 @@ pub struct EffortCurve {
 pub struct EffortSetting {
     /// Value of the varied parameter.
     pub value: u32,
-    /// Measurements with this value of the parameter, with the method and the fraction of kept Gaussians.
+    /// Method, fraction of kept Gaussians, and measurements with this value of the parameter.
     #[serde(flatten)]
     pub point: TradeOffPoint,
 }
 
-/// Columns in a CSV file that describe one point (method and kept fraction).
+/// Names of the CSV columns that describe one point, that is, one method at one fraction of kept Gaussians.
 const COLUMNS: [&str; 10] =
     ["method", "asked", "count", "fraction", "bytes", "psnr", "ssim", "temporal", "seconds", "peak_memory_bytes"];
 

@@ -2,8 +2,8 @@
 //! original values.
 //!
 //! Input: pairs of original and stored attributes of each Gaussian. Output: the largest errors, or an error that names
-//! the Gaussian furthest beyond its bound. Gaussians with an opacity below 1/255 before and after are never drawn and
-//! are not checked.
+//! the Gaussian furthest beyond its bound. A Gaussian whose original and stored opacity are both below 1/255 is never
+//! drawn and is not checked.
 //!
 //! | quantity | maximum error |
 //! |---|---|
@@ -15,11 +15,11 @@
 //! The scene size is the median distance of the Gaussians from their median position, so a single far Gaussian does not
 //! change it. The distance of two positions is the largest of the differences along x, y and z.
 //!
-//! A scale may become smaller by any amount if the stored scale is still at least ten times the distance from the
-//! Gaussian's center to the far side of the scene. This distance is the distance of the center from the median position
-//! plus the scene size, which must not be 0. Along such an axis the density falls by less than 1/200 within the scene,
-//! whatever the scale is. Captured scenes have such Gaussians. Formats with a maximum scale, such as `.spz`, store the
-//! maximum for them.
+//! One exception: a stored scale may be smaller than the original one by any amount if it is still at least ten times
+//! the distance from the Gaussian's center to the far side of the scene. This distance is the scene size, which must
+//! not be 0, plus the distance of the center from the median position. Along such an axis the density falls by less
+//! than 1/200 within the scene, whatever the scale is. Captured scenes have such Gaussians. Formats with a maximum
+//! scale, such as `.spz`, store the maximum for them.
 
 use std::path::Path;
 
@@ -89,7 +89,8 @@ pub fn check_positions(state: &Gaussians, path: &Path, kind: &str) -> Result<()>
     )))
 }
 
-/// Error of one quantity of one Gaussian, with the maximum error allowed for it.
+/// Coding error (original minus stored value) of one attribute of Gaussian `id` that exceeds its allowed maximum
+/// `bound`. `quantity` is the name of the attribute for messages.
 #[derive(Debug, Clone, Copy)]
 struct Excess {
     id: usize,
@@ -105,12 +106,13 @@ pub struct CodingErrors {
     middle: [f64; 3],
     /// Scene size: median distance of the Gaussians from their median position, in scene units.
     scene: f64,
-    /// Index of the Gaussian that is furthest from the median position of all Gaussians.
+    /// Index of the Gaussian that is furthest from the median position of all Gaussians. A message about a position
+    /// error names it, because such an outlier enlarges the range in which positions are stored.
     furthest: usize,
     /// Largest error of a position so far, in scene units.
     position: f64,
-    /// Number of Gaussians with a scale whose stored value is smaller by more than the usual bound. This is allowed,
-    /// because the stored scale is still much larger than the scene.
+    /// Number of Gaussians with a scale that is stored more than 1/10 too small. This is allowed, because the stored
+    /// scale is still at least ten times as large as the scene.
     reduced_scales: usize,
     /// Error that exceeds its allowed maximum by the largest factor; `None` if no error exceeds its maximum.
     worst: Option<Excess>,
@@ -133,13 +135,14 @@ impl CodingErrors {
         self.position
     }
 
-    /// Returns the number of Gaussians added so far with a scale whose stored value is smaller by more than the usual
-    /// bound. This is allowed, because the stored scale is still much larger than the scene.
+    /// Returns the number of Gaussians added so far with a scale that is stored more than 1/10 too small. This is
+    /// allowed, because the stored scale is still at least ten times as large as the scene.
     pub fn reduced_scales(&self) -> usize {
         self.reduced_scales
     }
 
-    /// Compares the original attributes `wanted` of Gaussian `id` with its stored ones `found` and records the errors.
+    /// Compares the original attributes `wanted` of Gaussian `id` with its stored attributes `found` and records the
+    /// errors. Ignores a Gaussian whose opacity is below 1/255 in both.
     pub fn add(&mut self, id: usize, wanted: &RenderedAttributes, found: &RenderedAttributes) {
         if wanted.opacity < MIN_OPACITY && found.opacity < MIN_OPACITY {
             return;
@@ -176,7 +179,8 @@ impl CodingErrors {
         self.check_error(id, "color", max_difference(before, after), MAX_COLOR_ERROR);
     }
 
-    /// Records the error of one SH coefficient above degree 0 of Gaussian `id`.
+    /// Records `error`, the magnitude of the difference between the original and the stored value of one SH coefficient
+    /// above degree 0 of Gaussian `id`.
     pub fn add_sh(&mut self, id: usize, error: f64) {
         self.check_error(id, "SH coefficient", error, MAX_SH_ERROR);
     }

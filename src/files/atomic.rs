@@ -32,8 +32,9 @@ pub use warnings::take_warnings;
 pub use workspace::{ExitGuard, remove_unfinished};
 use workspace::{SCRATCH, Workspace, user_path};
 
-/// Checks, before any work, that a run that reads `inputs` may write an output of the kind `kind` (file or folder) to
-/// `target`. Completes or removes an output with this name that a killed run left unfinished.
+/// Checks, before a run does any work, that it may write its output to `target`. `kind` says whether the output is a
+/// file or a folder, and `inputs` are the paths that the run reads. If a killed run left an unfinished output of this
+/// name, completes or removes it.
 ///
 /// Refuses these targets:
 ///
@@ -94,8 +95,9 @@ fn check_writable(target: &Path, parent: &Path) -> Result<()> {
     }
 }
 
-/// Checks, as [`check_target`] does for one file, that a run that reads `inputs` may write `target` and the files
-/// `companions` beside it. `replace` says which existing files may be replaced.
+/// Checks, before a run does any work, that it may write the file `target` and the files `companions` beside it. Each
+/// of them is checked as in [`check_target`]. `inputs` are the paths that the run reads, and `replace` says which
+/// existing files may be replaced.
 ///
 /// # Errors
 /// Fails like [`check_target`], and if one of these paths is a device or FIFO, which can hold only one file.
@@ -193,12 +195,12 @@ impl StagedFiles {
         self.file.workspace.folder.join(companion_name(index))
     }
 
-    /// Adds the list of all files to the summary (the first companion), syncs the files to disk and gives them their
-    /// final names. The summary is moved into place first, so that the other files are known as parts of this result
-    /// from the start; the output file itself is moved last.
+    /// Publishes the output file and its companions: adds the list of all these files to the summary (the first
+    /// companion), syncs the files to disk and renames them to their final names. The summary is renamed first and the
+    /// output file last, so that at every moment a summary says to which result a published file belongs.
     ///
     /// Runs with the same output publish one after the other, so files of different runs are never mixed. If the
-    /// process is killed while the files are being moved, the next run with this output publishes the remaining files.
+    /// process is killed between two renames, the next run with this output completes the set.
     ///
     /// # Errors
     /// Fails if the summary is not a JSON object, and like [`StagedFile::commit`] for each file.
@@ -336,9 +338,13 @@ impl ScratchFolder {
     }
 }
 
-/// Replaces a path in a hidden workspace, if `error` contains one, by a path that the user knows, and returns the
-/// error. For an output this is the output path that the user gave; for a scratch file, the folder that holds the file.
-/// Only errors of system calls contain such paths; other errors are returned unchanged.
+/// Returns `error` with a path that the user knows. Errors of system calls may contain a path in a hidden workspace,
+/// which the user has never seen. The path in the returned error is then:
+///
+/// - for an output: the output path that the user gave
+/// - for a scratch file: the folder that holds the scratch file
+///
+/// Other errors are returned unchanged.
 pub fn with_user_path(error: Error) -> Error {
     let (action, path, source) = match error {
         Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {

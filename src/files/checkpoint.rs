@@ -1,4 +1,4 @@
-//! PyTorch checkpoints as written by `torch.save`.
+//! Reads PyTorch checkpoints, as `torch.save` writes them.
 //!
 //! Input: a path. Output: the object tree of the pickle (the serialized Python objects in the file), and the values of
 //! requested tensors. Nothing in the pickle is executed. Memory: the list of files in the zip archive, the object tree,
@@ -32,12 +32,12 @@ use crate::limits::ReadLimit;
 const MAX_PICKLE: u64 = 1 << 23;
 /// Maximum number of files in the zip archive of a checkpoint.
 const MAX_ENTRIES: u64 = 1 << 16;
-/// Bytes of memory that the parsed list of files takes per file, in addition to three times the length of the list in
-/// the archive.
+/// Bytes of memory to count per file of the zip archive, for the list of files in memory. Three times the length of the
+/// list in the archive is counted in addition.
 const ENTRY_BYTES: u64 = 640;
-/// Maximum number of tensor elements per value of the storage (block of tensor values) that holds them. A tensor may
-/// repeat stored values (stride 0), so a small file can declare any number of elements. No trained model needs a larger
-/// number.
+/// Maximum ratio of the number of elements of a tensor to the number of values in its storage (block of tensor values).
+/// Trained models do not exceed it. The limit is needed because a tensor may repeat stored values (stride 0), so a
+/// small file can declare a huge tensor.
 const MAX_EXPANSION: usize = 4;
 
 /// PyTorch checkpoint that is open for reading.
@@ -135,8 +135,8 @@ impl ValueType {
     }
 }
 
-/// Tensor as a view of a storage (block of values): the element with indices `i` is value `offset + Σ i·stride` of the
-/// storage.
+/// Description of a tensor, without its values. The values are in a storage (block of values): the element with indices
+/// `i` is value number `offset + Σ i·stride` of the storage. All strides and offsets count values.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TensorView {
     /// Node of the object tree that builds the tensor. For a parameter, the node of the tensor inside it.
@@ -150,7 +150,8 @@ pub(crate) struct TensorView {
     pub(crate) places: NumberRanges,
 }
 
-/// Byte ranges in the pickle at which the numbers that describe a tensor are written.
+/// Byte ranges of some numbers in a pickle: those that describe one tensor. A writer replaces these numbers to change
+/// the shape of the tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct NumberRanges {
     /// Byte range of the number that states how many values the storage holds.
@@ -441,7 +442,8 @@ impl Checkpoint {
         Ok(values)
     }
 
-    /// Calls `take` with the name, kind and content of every file in the checkpoint's zip archive, in order.
+    /// Calls `take` for every file in the checkpoint's zip archive, in order. The arguments are the path of the file in
+    /// the archive, its kind (pickle, storage or other) and its bytes.
     ///
     /// # Errors
     /// Fails if a file is damaged or `take` fails.
@@ -503,7 +505,7 @@ pub(crate) fn legacy_format(path: &Path) -> Error {
     .hint("convert it: python3 -c \"import torch; torch.save(torch.load('OLD', map_location='cpu'), 'NEW')\"")
 }
 
-/// Name that error messages use for the list of files in the archive.
+/// Text for the location in the file ("list of files") in errors about an invalid list of files of the zip archive.
 const LIST: &str = "list of files";
 
 /// Returns whether the text "big" is at byte `at` of the file. PyTorch stores it if the values are big-endian.

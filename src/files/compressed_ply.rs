@@ -8,8 +8,9 @@
 //! | `packed_position` | 11, 10, 11 | x, y, z as fractions of their ranges in the chunk |
 //! | `packed_rotation` | 2, 10, 10, 10 | index of the omitted one of w, x, y, z; the others, from −1/√2 to 1/√2 |
 //! | `packed_scale` | 11, 10, 11 | ln s along x, y, z as fractions of their ranges in the chunk |
-//! | `packed_color` | 8, 8, 8, 8 | red, green, blue as fractions of their ranges (0 to 1 without `min_r`); opacity |
+//! | `packed_color` | 8, 8, 8, 8 | red, green, blue as fractions of their ranges; opacity |
 //!
+//! The properties with the ranges of red, green and blue (`min_r` …) are optional; without them the ranges are 0 to 1.
 //! The optional element `sh` holds one byte per coefficient `f_rest_*`, from −4 to 4. Source: the reader of
 //! splat-transform 3.7 of PlayCanvas.
 
@@ -37,7 +38,8 @@ struct Table<'a> {
 }
 
 impl<'a> Table<'a> {
-    /// Returns the property called `name`. Fails if there is no such property or if its type is not `scalar`.
+    /// Returns the property called `name`, which must have the number type `scalar`. Fails if it is missing or has
+    /// another type.
     fn property(&self, name: &str, scalar: Scalar) -> Result<&'a Property> {
         let place = format!("element {}", quoted(&self.element.name));
         let expected = format!("a property {} {name}", scalar.name());
@@ -48,7 +50,7 @@ impl<'a> Table<'a> {
         }
     }
 
-    /// Returns the four bytes of the property that begins at byte `offset` of row `row`.
+    /// Returns the four bytes that begin at byte `offset` of row `row`: a property of the type `uint`.
     fn word(&self, row: usize, offset: usize) -> [u8; 4] {
         let bytes = &self.bytes[row * self.element.stride + offset..][..4];
         [bytes[0], bytes[1], bytes[2], bytes[3]]

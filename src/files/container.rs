@@ -1,4 +1,4 @@
-//! `gseq` container (this project's sequence file) as a source of frames.
+//! Reads frames of Gaussians from a `gseq` container (this project's file format for sequences).
 //!
 //! Input: the file. Output: the attributes of any Gaussians at any frame. A tile holds the values of one attribute for
 //! a block of consecutive Gaussians and a block of consecutive frames. Memory: buffers for each reader (`TileReader`),

@@ -1,4 +1,4 @@
-//! CSV tables: a header line of names, then one line per row. A missing value is an empty field.
+//! Formats CSV tables: a header line of names, then one line per row. A missing value is an empty field.
 //!
 //! Spreadsheets execute a field that begins with one of `= + - @`, a tab or a carriage return as a formula. An
 //! apostrophe is put before such a field, which marks it as text. Numbers are unchanged.

@@ -1,11 +1,12 @@
 //! Counts of the rows of a file that violate its format (defective rows), and of how the reader treated them: dropped
 //! or repaired.
 
-/// Maximum number of row indices that a note to the user lists per kind of defect.
+/// Maximum number of row indices in a note to the user about one kind of defect.
 pub const LISTED_ROWS: usize = 5;
 /// How an infinite opacity logit is repaired, for notes to the user.
 pub const INFINITE_LOGIT_REPAIR: &str = "read as ±100, which is opaque or invisible";
-/// Fraction of dropped rows above which the note with the totals comes before the notes about single kinds of defects.
+/// Fraction of dropped rows above which the totals are the first of the notes to the user. At or below it they are the
+/// last.
 const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
 /// Counts of the rows of a file that have defects, and of the rows that the reader dropped because of defects.
@@ -100,8 +101,9 @@ impl Defects {
     }
 }
 
-/// Returns the first five of `count` row indices or ids as a list for messages, followed by dots if there are more.
-/// `first` holds at least the first five, or all if there are fewer.
+/// Returns a list for messages of the first five row indices or ids, such as `3, 7, 9`, followed by dots if there are
+/// more. `count` is the number of all indices; `first` holds at least the first five of them, or all if there are
+/// fewer.
 pub fn first_of(first: &[u32], count: usize) -> String {
     let listed: Vec<String> = first.iter().take(LISTED_ROWS).map(u32::to_string).collect();
     listed.join(", ") + if count > listed.len() { ", ..." } else { "" }

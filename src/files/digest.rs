@@ -1,4 +1,4 @@
-//! Hashing of files in chunks, so that the memory does not depend on the length of a file.
+//! Hashes files. A file is read in chunks, so that the memory does not depend on its length.
 
 use std::fs::File;
 use std::io::Read;

@@ -1,4 +1,5 @@
-//! `.ftgs.ply` files, version 1, of the player ftgs-player: Gaussians with linear motion in Gaussian windows of time.
+//! Reads and writes `.ftgs.ply` files, version 1, of the player ftgs-player. Each Gaussian moves linearly, and its
+//! opacity rises and falls like a Gaussian function of time (its time window).
 //!
 //! A PLY file with the properties of the INRIA layout and five more floats per Gaussian: `time` (center of its window),
 //! `log_duration` (natural logarithm of the standard deviation σ of the window) and `velocity_0..2`. Time t of the
@@ -38,7 +39,8 @@ const OWN_PROPERTIES: [&str; PARAMS_PER_GAUSSIAN] = ["time", "log_duration", "ve
 /// First word of the header comment by which a file of this format is recognized.
 pub const MARKER_COMMENT: &str = "ftgs_version";
 
-/// Mapping of the times of a sequence to the range from 0 to 1, and the number and rate of its frames.
+/// Mapping of the times of a sequence to the time from 0 to 1 that players use, with the number of frames and the frame
+/// rate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClipTimes {
     /// Time of the original sequence that is mapped to 0.
@@ -55,11 +57,12 @@ pub struct ClipTimes {
 pub const FRAME_RATE: f64 = 30.0;
 
 impl ClipTimes {
-    /// Mapping for a sequence whose times run from 0 to 1 already and whose number of frames is not known.
+    /// Mapping that leaves times unchanged: the times of the sequence run from 0 to 1 already. The number of frames is
+    /// not known.
     pub const UNIT_INTERVAL: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None, frame_rate: FRAME_RATE };
 
-    /// Returns the mapping of the increasing `times`, one per frame, to the range from 0 to 1. If there are fewer than
-    /// two times, the range of time that is mapped has length 1.
+    /// Returns the mapping of the increasing `times`, one per frame, to the range from 0 to 1: the first time becomes
+    /// 0, the last becomes 1. With fewer than two times, the time 1 after the first one (or after 0) becomes 1.
     pub fn from_times(times: &[f64]) -> ClipTimes {
         let first = times.first().copied().unwrap_or(0.0);
         let last = times.last().copied().filter(|&last| last > first).unwrap_or(first + 1.0);
@@ -71,8 +74,8 @@ impl ClipTimes {
         (time - self.first) / (self.last - self.first)
     }
 
-    /// Returns the mapping of the times from `first` to `last`, for an unknown number of frames; `None` if the two
-    /// times are not finite or do not increase.
+    /// Returns the mapping of times that maps `first` to 0 and `last` to 1, for an unknown number of frames. Returns
+    /// `None` if a time is not finite or `last` is not greater than `first`.
     pub(crate) fn from_range(first: f64, last: f64) -> Option<ClipTimes> {
         let is_range = first.is_finite() && last.is_finite() && last - first > 1e-12 * first.abs().max(last.abs());
         is_range.then_some(ClipTimes { first, last, ..ClipTimes::UNIT_INTERVAL })
@@ -105,15 +108,18 @@ pub struct Ftgs {
     pub defects: Defects,
 }
 
-/// Defect of a row (Gaussian) with a value that is not finite: its name, whether the row is left out, and the reason.
+/// Defect of a row (Gaussian) with a value that is not finite. The elements are the name of the defect, whether rows
+/// with it are left out, and the reason.
 const NON_FINITE: (&str, bool, &str) = ("NaN or infinite value", true, "the player refuses files with such values");
-/// Defect of a row (Gaussian) with a zero quaternion, if such rows are left out. Same form as [`NON_FINITE`].
+/// Defect of a row (Gaussian) with a zero quaternion, if the user does not ask to keep such rows: name, whether rows
+/// with it are left out, and the reason.
 const ZERO_QUATERNION: (&str, bool, &str) = (
     "zero quaternion",
     true,
     "the player refuses files with such rotations; --zero-rotation identity keeps the Gaussians without a rotation",
 );
-/// Defect of a row (Gaussian) with a zero quaternion, if such rows are kept. Same form as [`NON_FINITE`].
+/// Defect of a row (Gaussian) with a zero quaternion, if the user asks to keep such rows: name, whether rows with it
+/// are left out, and the reason.
 const KEPT_ZERO_QUATERNION: (&str, bool, &str) =
     ("zero quaternion", false, "taken as the identity, as --zero-rotation asks");
 
@@ -166,8 +172,8 @@ impl FtgsHeader {
 }
 
 impl Ftgs {
-    /// Reads the file at `path`. Gaussians with values that are not finite are left out, and so are Gaussians with a
-    /// zero quaternion unless `zero_rotation` keeps them.
+    /// Reads the Gaussians of the file at `path`. Leaves out Gaussians with a value that is not finite. `zero_rotation`
+    /// determines whether Gaussians with a zero quaternion are left out or get the identity as rotation.
     ///
     /// # Errors
     /// Fails if the file is not a PLY of Gaussians, lacks a property, has another version or unit of time, or if all
@@ -242,9 +248,9 @@ pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Resul
     write_ftgs_with(params, clip, MIN_TIME_DEVIATION, path)
 }
 
-/// Writes a file as [`write_ftgs`] does, but so that players show every time window with the standard deviation in
-/// `params`. For this purpose the header states the smallest deviation as the minimum if it is below
-/// [`MIN_TIME_DEVIATION`].
+/// Writes a file like [`write_ftgs`], but without widening narrow time windows. Players widen every window to a minimum
+/// standard deviation, which the header states. Here it states the smallest deviation in `params` if that is below the
+/// usual minimum [`MIN_TIME_DEVIATION`].
 ///
 /// # Errors
 /// Fails if the file cannot be written.

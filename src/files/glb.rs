@@ -1,4 +1,5 @@
-//! `.glb` files (glTF 2.0) with the extension `KHR_gaussian_splatting`: one frame of Gaussians without compression.
+//! Reads and writes `.glb` files (glTF 2.0) with the extension `KHR_gaussian_splatting`, which hold one frame of
+//! Gaussians without compression.
 //!
 //! The primitive of mode 0 (points) has these attributes; glTF's x axis points left and its y axis up.
 //!
@@ -20,10 +21,10 @@ pub mod write;
 pub const MAGIC: u32 = 0x4654_6c67;
 /// Version of glTF that is read and written.
 const VERSION: u32 = 2;
-/// Type of the chunk that holds the JSON text, and (`BINARY`) of the chunk that holds the values.
+/// Chunk type of the JSON text in a `.glb` file. `BINARY` is the chunk type of the values.
 const JSON: u32 = 0x4e4f_534a;
 const BINARY: u32 = 0x004e_4942;
-/// Name of the extension, and prefix of its attributes.
+/// Name of the glTF extension for Gaussians, and prefix of the names of its attributes.
 const EXTENSION: &str = "KHR_gaussian_splatting";
 /// Sign by which each SH coefficient above degree 0 is multiplied when the x and y axes are reversed.
 const AXIS_SIGNS: [f32; 15] = [-1., 1., -1., 1., -1., 1., -1., 1., -1., 1., -1., 1., -1., 1., -1.];

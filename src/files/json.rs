@@ -1,8 +1,9 @@
 //! Streaming reader of JSON files.
 //!
 //! Input: the path of a file of any length. Output: the value built by a [`DeserializeSeed`]. Memory: a buffer of 64
-//! KiB, one string, and the values that the seed keeps. Strings, numbers and nesting depths larger than those of any
-//! camera file are refused before the parser sees them, because the parser keeps a whole string in memory.
+//! KiB, one string, and the values that the seed keeps. A seed is a deserializer of serde that carries state. The
+//! limits on strings, numbers and nesting depth are larger than in any camera file. They are checked before the parser
+//! sees the bytes, because the parser keeps a whole string in memory.
 
 mod checked;
 pub(crate) mod lists;
@@ -21,22 +22,22 @@ use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 use checked::CheckedReader;
 
-/// Storage for the error with which a seed (builder of a value) stops the parser. The error type of the parser itself
-/// cannot hold this error.
+/// Slot for the error with which a seed (deserializer of a value) wants to stop the JSON parser. The seed cannot return
+/// this error itself, because it must return an error of the parser's type.
 #[derive(Debug, Default)]
 pub(crate) struct ParseAbort(RefCell<Option<Error>>);
 
 impl ParseAbort {
-    /// Stores `error`, and returns a parser error. A deserializer (seed) that returns the parser error stops the JSON
-    /// parser; [`read`] then fails with `error`.
+    /// Stores `error` and returns an error of the parser's type. A seed (deserializer of a value) returns the latter to
+    /// stop the JSON parser; [`read`] then fails with `error`.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
         E::custom("stopped")
     }
 }
 
-/// Reads the JSON document in the file at `path` and returns the value that the deserializer `seed` builds from it. To
-/// stop with an error of its own, `seed` stores the error in `stopped`.
+/// Reads the JSON document in the file at `path` and returns the value that `seed` (a deserializer) builds from it.
+/// `stopped` is the slot into which `seed` puts an error of its own before it stops; see [`ParseAbort`].
 ///
 /// # Errors
 /// Fails if the seed fails, the file cannot be read, the text is not UTF-8 or not JSON (the message names the place),
@@ -49,8 +50,8 @@ pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     read_from(open_file(path)?, path, stopped, seed)
 }
 
-/// Reads the JSON document in `file` as [`read`] does, with the same `stopped` and `seed`. Error messages call the file
-/// `path`.
+/// Reads the JSON document in the open `file` as [`read`] does, and returns the value that `seed` builds from it. Error
+/// messages call the file `path`.
 ///
 /// # Errors
 /// Fails like [`read`].

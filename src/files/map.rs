@@ -15,7 +15,8 @@ use splat_platform::{FileIdentity, FileStatus, release_pages};
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Number of bytes of a mapped file that may be resident before its pages are released. A release takes about 2 µs.
+/// Number of bytes of a mapped file that may be resident (in memory). When it is exceeded, the pages of the map are
+/// released, which takes about 2 µs.
 const MAX_RESIDENT_BYTES: usize = 2 << 20;
 /// Bytes around a page read by this process that the system may map together with it (Linux: fault-around of 64 KiB).
 const FAULT_AROUND_BYTES: usize = 1 << 16;
@@ -24,10 +25,12 @@ const FAULT_AROUND_BYTES: usize = 1 << 16;
 #[derive(Debug)]
 pub(crate) struct FileMap {
     path: PathBuf,
-    /// Identity of the file; `None` for a scratch file, which no other process can reach.
+    /// Identity of the mapped file. With it, [`FileMap::check`] distinguishes the mapped file from another file that
+    /// has taken its path. `None` for a scratch file, which no other process can reach.
     identity: Option<FileIdentity>,
     map: Mmap,
-    /// Number of bytes reported as read since the last release, and (`last_end`) end of the last reported range.
+    /// Estimated number of bytes of the map that are in memory: the bytes reported as read since pages were last
+    /// released, and their surroundings. `last_end` is the end of the last range that was reported.
     resident: AtomicUsize,
     last_end: AtomicUsize,
 }
@@ -84,8 +87,9 @@ impl FileMap {
         }
     }
 
-    /// Records that the bytes of `range` were or will be read. Releases the pages of the map once about 2 MiB of them
-    /// may be resident. Slices of the map stay valid, because released pages are read from the file again on access.
+    /// Records that a reader has read or is about to read the bytes `range` of the map. Every reader calls this, so
+    /// that the map can release its pages when about 2 MiB of them may be resident (in memory). Slices of the map stay
+    /// valid, because released pages are read from the file again on access.
     pub(crate) fn touched(&self, range: Range<usize>) {
         let gap = self.last_end.swap(range.end, Ordering::Relaxed).abs_diff(range.start).min(FAULT_AROUND_BYTES);
         let more = gap + range.len();

@@ -1,16 +1,16 @@
-//! Names by which outputs record other files. Outputs are published, so they must not contain folder names of the
-//! user's machine. An input is recorded by its last name only. A file that a recipe (file of all parameters) needs
-//! again is recorded by its path relative to the recipe.
+//! Names under which outputs mention other files. Outputs are published, so they must not contain names of folders on
+//! the user's machine. An input file is mentioned by the last component of its path. A file that a recipe (file of all
+//! parameters) needs again is mentioned by its path relative to the recipe.
 
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
 use crate::error::ShowPath;
 
-/// Number of leading folders that a file and the recipe that names it must share, so that the recipe records the file
-/// by a relative path. With fewer shared folders, the recipe records only the last component of the path, unless the
-/// common folder is the working directory or lies below it. The reason is that a relative path could reveal a folder
-/// name: a relative path from `/home/a/small` to `/home/b/data` would contain `b`.
+/// Minimum number of leading folders that a file and the recipe that names it must share, so that the recipe may name
+/// the file by a relative path. One shared folder is enough if it is the working directory or lies below it. Otherwise
+/// the recipe states only the last component of the path, because a relative path could reveal the name of a private
+/// folder: a relative path from `/home/a/small` to `/home/b/data` would contain `b`.
 const MIN_SHARED_FOLDERS: usize = 2;
 
 /// Returns the last component of `path`; for `.` and paths that end in `..`, the name of the folder they stand for.

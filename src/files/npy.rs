@@ -1,19 +1,23 @@
-//! Checks that the header of a NumPy array must pass before it is given to a parser.
+//! Checks the header of a NumPy array file, which may be malicious, before the header is given to the parser of another
+//! crate.
 
 /// Maximum length in bytes of the header of an array file. The header of an array of numbers usually has 118 bytes, and
 /// at most 54 more for every axis.
 const MAX_HEADER_BYTES: u64 = 4096;
-/// Number of bytes at the start of an array file that contain the whole header, if the header has at most
-/// [`MAX_HEADER_BYTES`].
+/// Number of bytes to read from the start of an array file for checking its header: the maximum length of the header,
+/// and 12 bytes for the magic, the version and the length before it.
 pub(crate) const HEAD: u64 = MAX_HEADER_BYTES + 12;
-/// Maximum number of digits in a shape, so that the product of its lengths stays below 2⁶³.
+/// Maximum number of digits in the shape of an array, all axes together. The number of elements is then below 2⁶³.
 const MAX_SHAPE_DIGITS: usize = 18;
 /// Maximum nesting depth of brackets: the dictionary, the shape in it, and one more level.
 const MAX_BRACKET_DEPTH: usize = 3;
 
-/// Returns whether the header of an array file may be given to the parser: the file holds the whole header, and its
-/// length, the digits of its shape and the nesting of its brackets are within their limits. `head` holds the first
-/// [`HEAD`] bytes of the file, or all if it is shorter; `bytes` is the length of the file.
+/// Returns whether the header of a NumPy array file may be given to the parser. `head` holds the first [`HEAD`] bytes
+/// of the file, or all of them if the file is shorter; `bytes` is the length of the file. The conditions are:
+///
+/// - The file holds the whole header.
+/// - The length of the header, the number of digits in its shape and the nesting depth of its brackets do not exceed
+///   their limits.
 ///
 /// The parser itself is unsafe for forged headers. It allocates the declared header length (up to 4 GiB) before
 /// reading, its time doubles with every open bracket, and it multiplies the lengths of a shape without a check for

@@ -27,8 +27,8 @@ use crate::error::{Error, Result};
 const MAX_ARRAYS: usize = 4096;
 /// Maximum size in bytes of the list of files that an archive has at its end.
 const MAX_LIST: u64 = 4 << 20;
-/// Maximum number of bytes of decoded arrays, in the scratch file, per byte of the archive; [`BASE_SCRATCH_BYTES`] are
-/// allowed in addition. Trained models need 1 to 2.
+/// Maximum ratio of the bytes of all decoded arrays, which are written to a scratch file, to the bytes of the archive.
+/// [`BASE_SCRATCH_BYTES`] are allowed in addition. Trained models need a ratio of 1 to 2.
 const SCRATCH_PER_BYTE: u64 = 64;
 /// Number of bytes of decoded arrays that are allowed in the scratch file for an archive of any size.
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
@@ -50,7 +50,7 @@ pub(crate) struct NpzArray {
     pub(crate) name: String,
     /// Length of every axis, the slowest axis first.
     pub(crate) shape: Vec<usize>,
-    /// Floating-point type of the values; `None` if they are not floating-point, or are in Fortran order.
+    /// Floating-point type of the values; `None` if the values cannot be read as floats in C order (last axis fastest).
     pub(crate) float: Option<Float>,
     /// Type of the values in NumPy's notation, such as `<f4`.
     pub(crate) descr: String,
@@ -62,7 +62,8 @@ pub(crate) struct NpzArray {
     stored: u64,
     /// Index of the array among the files of the archive.
     index: usize,
-    /// Length of the header in bytes, and (`start`) offset of the values in the file if they are not compressed.
+    /// Length in bytes of the array's header. `start` is the offset in the archive of the first value; it has a meaning
+    /// only if the array is not compressed.
     header: usize,
     start: usize,
 }
@@ -189,8 +190,10 @@ impl Npz {
         self.entries.iter().find(|entry| entry.name == name)
     }
 
-    /// Checks that the arrays called `names` exist, hold floating-point numbers in C order, and need no more scratch
-    /// space than is allowed for an archive of this length. Decodes no values.
+    /// Checks the headers of the arrays called `names`, without decoding values:
+    ///
+    /// - Each array exists and holds floating-point numbers in C order (last axis fastest).
+    /// - Decoding them takes at most as much scratch space as is allowed for an archive of this length.
     ///
     /// # Errors
     /// Fails if one of these conditions does not hold; the message names the array.
@@ -259,7 +262,8 @@ impl Npz {
         Ok(Floats { map: Arc::new(map), start: 0, len: entry.len() })
     }
 
-    /// Calls `take` with a reader of the decompressed bytes of the values of `entry`.
+    /// Calls `take` once, with a reader of the values of the array `entry` as bytes, decompressed and without the
+    /// header.
     ///
     /// # Errors
     /// Fails if `take` fails, or if the file was cut short since it was opened.
@@ -278,8 +282,11 @@ impl Npz {
     }
 }
 
-/// Opens the zip archive at `path`. Returns an outer error if the file cannot be opened, and an inner error, which
-/// describes what was found, if its content is no valid archive.
+/// Opens the zip archive at `path`. Returns one of three results:
+///
+/// - `Err`: the file cannot be opened.
+/// - `Ok(Err(found))`: the file is no valid zip archive; `found` says what is wrong.
+/// - `Ok(Ok(archive))`: the open archive.
 fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
     let mut file = open_file(path)?;
     let directory = match declared_directory(&mut file) {
@@ -296,8 +303,8 @@ fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File
 }
 
 impl NpzArray {
-    /// Returns whether the values of this array, which have the type `float`, can be read directly from the mapped
-    /// archive.
+    /// Returns whether the values of this array can be read directly from the mapped archive: they are not compressed,
+    /// and their type `float` is little-endian f32.
     fn is_in_place(&self, float: Float) -> bool {
         !self.is_compressed && float == Float::F32
     }
@@ -330,8 +337,8 @@ impl NpzArray {
     }
 }
 
-/// Values of one array as f32, in the order in which the array stores them. They lie in a memory-mapped file: the
-/// archive, or a scratch file.
+/// Values of one array as f32, in the order in which the array stores them: `len` values from byte `start` on in a
+/// memory-mapped file. This file is the archive itself or a scratch file with the decoded values.
 #[derive(Debug, Clone)]
 pub(crate) struct Floats {
     map: Arc<FileMap>,

@@ -5,14 +5,15 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha2::{Digest, Sha256};
 
-/// Returns the policy entry (a digest in quotes) that allows an inline script or style. `content` is the text between
-/// its tags.
+/// Returns the digest by which a content security policy allows one inline script or style, such as `'sha256-…'` (with
+/// the quotes). `content` is the text between the tags of the script or style.
 pub fn policy_digest(content: &str) -> String {
     format!("'sha256-{}'", STANDARD.encode(Sha256::digest(content)))
 }
 
-/// Returns the `<meta>` element of a content security policy that allows only `directives`. Each directive is a name
-/// with its allowed sources.
+/// Returns the `<meta>` element of an HTML page with a content security policy that forbids everything except
+/// `directives`. Each directive is a pair of a name, such as `img-src`, and the sources that it allows, such as
+/// `data:`.
 pub fn policy_meta_element(directives: &[(&str, &[String])]) -> String {
     let mut content = "default-src 'none'; base-uri 'none'; form-action 'none'".to_owned();
     for (name, sources) in directives.iter().filter(|(_, sources)| !sources.is_empty()) {

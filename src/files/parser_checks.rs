@@ -1,4 +1,5 @@
-//! Functions that read bytes in memory, for the fuzz targets: these run millions of inputs and must not write files.
+//! Entry points for fuzzing the parsers of pickles and camera files. They read bytes in memory, because a fuzz target
+//! runs millions of inputs and must not write files.
 
 use std::path::Path;
 
@@ -8,8 +9,9 @@ use super::json::{ParseAbort, read_from};
 use super::pickle::Pickle;
 use crate::error::Result;
 
-/// Reads the pickle `bytes`, using at most `memory` bytes of memory, and describes each value as text, to test that the
-/// description does not panic. Returns the number of values, or `None` if the pickle cannot be read.
+/// Fuzzing entry point for the pickle parser: reads the pickle `bytes` with at most `memory` bytes of memory and
+/// formats a description of each value, which must not panic. Returns the number of values; `None` if the pickle cannot
+/// be read.
 pub fn check_pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     let pickle = Pickle::read(bytes, memory).ok()?;
     let described: usize = pickle.ids().map(|id| pickle.describe(id).len().min(1)).sum();
@@ -17,8 +19,8 @@ pub fn check_pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     Some(described)
 }
 
-/// Reads `bytes` as the JSON of a camera file: first the values outside the list of frames, then each frame. Returns
-/// the number of values found.
+/// Fuzzing entry point for the JSON reader of camera files: reads `bytes` once without the lists, and once for each of
+/// the ways in which the image lists of camera files are read. Returns the number of values found.
 ///
 /// # Errors
 /// Fails if the text is not JSON or exceeds the limits on strings, numbers and nesting.

@@ -54,7 +54,8 @@ pub(crate) enum Node {
     Dict(Vec<(NodeId, NodeId)>),
     /// Result of calling `callee` with `arguments`, and the items that are set in the result afterwards.
     Called { callee: NodeId, arguments: NodeId, items: Vec<(NodeId, NodeId)> },
-    /// An object that is stored outside the pickle (persistent id). Holds the node that identifies the object.
+    /// Reference to an object that is stored outside the pickle (persistent id), such as the values of a tensor. The
+    /// field is the node of the value that identifies the object.
     PersistentId(NodeId),
 }
 
@@ -63,7 +64,8 @@ pub(crate) enum Node {
 pub(crate) struct Pickle {
     nodes: Vec<Node>,
     root: NodeId,
-    /// Byte ranges of the instructions that only announce the length of the bytes after them (FRAME).
+    /// Byte ranges of the FRAME instructions in the pickle. Such an instruction only announces how many bytes of
+    /// further instructions follow.
     frames: Vec<Range<usize>>,
 }
 
@@ -79,7 +81,8 @@ pub(crate) enum Wrong {
 }
 
 impl Wrong {
-    /// Builds the error for malformed content at byte `at` of the pickle; `found` describes this content.
+    /// Builds the error for a pickle with malformed content at byte `at`. `found` describes the content for the
+    /// message.
     fn at(at: usize, found: impl Into<String>) -> Wrong {
         Wrong::Malformed(at, found.into())
     }
@@ -199,9 +202,9 @@ impl Pickle {
         }
     }
 
-    /// Returns the bytes of the pickle with some integers replaced. `bytes` are the bytes from which this pickle was
-    /// read; `numbers` maps byte ranges of integers to their new values. Instructions that only announce lengths
-    /// (FRAME) are left out, because readers do not need them.
+    /// Returns the bytes of a copy of this pickle in which some integers have new values. `bytes` are the bytes from
+    /// which the pickle was read. `numbers` maps the byte range (start, end) of an integer instruction to the new
+    /// value. FRAME instructions, which only announce lengths that may now be wrong, are left out.
     pub(crate) fn with_numbers(&self, bytes: &[u8], numbers: &BTreeMap<(usize, usize), u64>) -> Vec<u8> {
         let mut edits: Vec<(Range<usize>, Vec<u8>)> =
             numbers.iter().map(|(&(start, end), &number)| (start..end, int(number))).collect();

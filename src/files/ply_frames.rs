@@ -1,4 +1,5 @@
-//! PLY files of a sequence, one per frame: their order and their common properties.
+//! Opens the PLY files of a sequence, one per frame: determines their order and checks that they have the same
+//! properties.
 //!
 //! Input: a folder with one PLY file per frame, or a single file. Output: the paths in frame order, the number of
 //! Gaussians in each file, and any of the files opened on request. Memory: the path and the number of Gaussians of
@@ -25,7 +26,8 @@ pub struct PlyFrames {
     counts: Vec<u32>,
     properties: Vec<Property>,
     sh_degree: usize,
-    /// For each frame whose file is a text file, its rows in binary form; `None` for binary files.
+    /// For each frame, the location of its rows in binary form if its file is a text file; `None` if it is a binary
+    /// file.
     texts: Vec<Option<TextRows>>,
     memory: ReadLimit,
 }
@@ -156,7 +158,8 @@ fn file_name(path: &Path) -> &OsStr {
 /// Hint for a sequence that is refused because frames are missing.
 const ALLOW_GAPS_HINT: &str = "--allow-gaps reads the existing frames as the whole sequence";
 
-/// Entries of a folder that are named like frames, in natural order.
+/// Entries of a folder whose names are those of frames of a sequence, sorted in natural order (`frame_2` before
+/// `frame_10`).
 pub(crate) struct FrameFiles {
     /// Entries that are files; each is a frame.
     frames: Vec<PathBuf>,
@@ -182,7 +185,8 @@ impl FrameFiles {
         Ok(FrameFiles { frames, others })
     }
 
-    /// Returns the paths of the frames in natural order. `folder` is the folder that was listed, for messages.
+    /// Returns the paths of all frames in natural order (`frame_2` before `frame_10`). `folder` is the folder that was
+    /// listed; error messages name it.
     ///
     /// # Errors
     /// Fails if the numbers of the frames have a gap or if an entry is not a file, unless `allow_gaps` is true.
@@ -202,11 +206,11 @@ impl FrameFiles {
     }
 }
 
-/// Finds the first gap in the frame numbers in the file names of `frames`. Returns the expected name of the missing
-/// frame and the names before and after the gap.
+/// Finds the first missing frame of a sequence with the files `frames`, whose names contain frame numbers. Returns
+/// three file names: the expected one of the missing frame, and those of the frames before and after the gap.
 ///
-/// A gap is a step between successive numbers that is larger than the smallest step. Returns `None` if there is no gap,
-/// or if the file names differ in more than their last number.
+/// A gap is a difference of successive frame numbers that is larger than the smallest such difference. Returns `None`
+/// if there is no gap, or if the file names differ in more than their last number.
 fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
     let parts = |path: &PathBuf| -> Option<(String, u64, String, usize)> {
         let name = file_name(path).to_str()?;
@@ -236,8 +240,8 @@ fn is_named_like_frame(path: &Path) -> bool {
         && !file_name(path).as_encoded_bytes().starts_with(b".")
 }
 
-/// Compares the names `a` and `b` in natural order (numbers in them by value), then by bytes, so that names equal in
-/// the natural comparison (`a 1`, `a1`) have a fixed order.
+/// Compares two file names in natural order: numbers in them compare by value, so `frame_2` is before `frame_10`. Names
+/// that are equal in this order, such as `a 1` and `a1`, compare by bytes, so that their order is fixed.
 fn natural_order(a: &OsStr, b: &OsStr) -> Ordering {
     natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then_with(|| a.cmp(b))
 }

@@ -1,4 +1,4 @@
-//! A dynamic scene stored as one PLY file per frame.
+//! Reads a dynamic scene that is stored as one PLY file per frame.
 //!
 //! Input: PLY files with the same Gaussians in the same order. Output: a [`FrameSource`], which reads any Gaussians at
 //! any frame. Memory: that of [`PlyFrames`].
@@ -72,8 +72,9 @@ impl PlySequence {
         self
     }
 
-    /// Returns the notes for the user about the files: for a single file, on every row with a defect; for several
-    /// files, only on parts that are not read.
+    /// Returns notes for the user about unusual content. For a sequence of one file, they count its rows (Gaussians)
+    /// with defects and name content that is not read. For several files, they only name content that is not read,
+    /// because counting would need a pass over all files.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
@@ -125,7 +126,7 @@ impl FrameSource for PlySequence {
     }
 }
 
-/// Reader of some of the Gaussians of a [`PlySequence`].
+/// Reader of a selection of the Gaussians of a [`PlySequence`], frame by frame.
 struct PlyBlock<'a> {
     sequence: &'a PlySequence,
     ids: OwnedIds,
@@ -140,7 +141,7 @@ impl BlockReader for PlyBlock<'_> {
     }
 }
 
-/// Copy of [`Ids`] (indices of Gaussians) that owns its list.
+/// Selection of Gaussians like [`Ids`] (a range or a list of indices) that owns its list instead of borrowing it.
 enum OwnedIds {
     Range(Range<usize>),
     List(Vec<u32>),

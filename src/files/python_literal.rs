@@ -17,10 +17,10 @@ pub(crate) enum Literal {
     Int(i64),
     Float(f64),
     Str(String),
-    /// Elements of a list or a tuple.
+    /// List or tuple, with its elements.
     Sequence(Vec<Literal>),
     Dict(Vec<(Literal, Literal)>),
-    /// Text with balanced brackets that is no literal, such as `device(type='cuda')` or `PosixPath('x')`.
+    /// Text that is not a Python literal, such as `device(type='cuda')` or `PosixPath('x')`. Its brackets are balanced.
     Opaque(String),
 }
 
@@ -45,7 +45,7 @@ impl fmt::Display for Literal {
 pub(crate) struct Argument {
     pub(crate) name: String,
     pub(crate) value: Literal,
-    /// Byte range of the value in the parsed text.
+    /// Byte range, in the parsed text, of the argument's value.
     pub(crate) place: Range<usize>,
 }
 
@@ -104,7 +104,7 @@ pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>
 
 struct Parser<'a> {
     text: &'a str,
-    /// Byte offset in the text of the next character; always at a character boundary.
+    /// Present position of the parser: byte offset in the text of the next character, always at a character boundary.
     at: usize,
 }
 
@@ -114,7 +114,7 @@ impl<'a> Parser<'a> {
         &self.text[self.at..]
     }
 
-    /// Builds the parse error that says that `expected` should be at the current position.
+    /// Returns a parse error at the present position of the parser. `expected` describes what should be there.
     fn error(&self, expected: &'static str) -> ParseError {
         ParseError { byte: self.at, expected }
     }
@@ -124,7 +124,7 @@ impl<'a> Parser<'a> {
         self.at = self.text.len() - self.rest().trim_start().len();
     }
 
-    /// Skips `token` if it comes next, and returns whether it did.
+    /// Skips `token` if the text continues with it, and returns whether it does.
     fn take(&mut self, token: &str) -> bool {
         let found = self.rest().starts_with(token);
         if found {
@@ -133,7 +133,7 @@ impl<'a> Parser<'a> {
         found
     }
 
-    /// Skips white space, then `token` if it comes next, and returns whether it did.
+    /// Skips white space. Then skips `token` if the text continues with it, and returns whether it does.
     fn take_token(&mut self, token: &str) -> bool {
         self.skip_space();
         self.take(token)
@@ -145,8 +145,8 @@ impl<'a> Parser<'a> {
         if self.take_token(token) { Ok(()) } else { Err(self.error(expected)) }
     }
 
-    /// Skips white space, then reads and returns the longest run of characters that can occur in names, keywords and
-    /// numbers.
+    /// Skips white space, then reads a name, keyword or number: the longest run of letters, digits and `_ . + -`.
+    /// Returns it; empty if another character comes first.
     fn word(&mut self) -> &'a str {
         self.skip_space();
         let rest = self.rest();
@@ -155,9 +155,9 @@ impl<'a> Parser<'a> {
         &rest[..end]
     }
 
-    /// Parses a value up to the next separator; the value lies inside `depth` open brackets. If the text up to the
-    /// separator is no literal, it becomes [`Literal::Opaque`]. Fails if `depth` is more than 32 or a bracket or quote
-    /// is missing.
+    /// Parses a value, such as an element of a list, up to the next separator (comma, colon or closing bracket).
+    /// `depth` is the number of brackets open around it. If the text up to the separator is no Python literal, it
+    /// becomes [`Literal::Opaque`]. Fails if `depth` is more than 32, or if a bracket or quote is missing.
     fn value(&mut self, depth: usize) -> Parsed<Literal> {
         self.skip_space();
         let start = self.at;
@@ -179,14 +179,15 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// Skips white space and returns whether a separator, a closing bracket or the end comes next.
+    /// Skips white space. Returns whether a value has ended: a comma, a colon, a closing bracket or the end of the text
+    /// comes next.
     fn at_separator(&mut self) -> bool {
         self.skip_space();
         matches!(self.rest().chars().next(), None | Some(',' | ')' | ']' | '}' | ':'))
     }
 
-    /// Parses a literal, which lies inside `depth` open brackets. Returns `None` if the next token does not begin a
-    /// literal.
+    /// Parses a Python literal. `depth` is the number of brackets open around it. Returns `None` if the text does not
+    /// continue with a literal.
     fn literal(&mut self, depth: usize) -> Parsed<Option<Literal>> {
         Ok(match self.rest().chars().next() {
             Some('\'' | '"') => Some(Literal::Str(self.string()?)),
@@ -296,7 +297,8 @@ impl<'a> Parser<'a> {
         Err(unterminated)
     }
 
-    /// Skips text with balanced brackets up to the next `,`, `:`, `=` or closing bracket of the enclosing construct.
+    /// Skips text that is not a Python literal: up to the next `,`, `:` or `=` outside brackets that open in it, or to
+    /// the bracket that closes the construct around it. Fails if brackets do not match.
     fn skip_balanced(&mut self) -> Parsed<()> {
         let mut open = Vec::new();
         while let Some(c) = self.rest().chars().next() {

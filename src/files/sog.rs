@@ -1,4 +1,5 @@
-//! `.sog` files, version 2 of the format (PlayCanvas): one frame of Gaussians as lossless WebP images in a ZIP archive.
+//! Reads and writes `.sog` files, version 2 of the format (PlayCanvas), which hold one frame of Gaussians as lossless
+//! WebP images in a ZIP archive.
 //!
 //! Pixel i of every image belongs to Gaussian i. Source: `docs/user-manual/gaussian-splatting/formats/sog.md` of
 //! playcanvas/developer-site, and the readers of splat-transform 3.7 and of the PlayCanvas engine 2.23.

@@ -1,5 +1,5 @@
-//! `.splatv` files: Gaussians that move on cubic polynomials in time and whose opacity follows a Gaussian window in
-//! time, as read by the players splaTV and WebGS.
+//! Reads and writes `.splatv` files of the players splaTV and WebGS. The position of each Gaussian is a cubic
+//! polynomial in time, and its opacity rises and falls like a Gaussian function of time (its temporal window).
 //!
 //! Layout, little-endian: u32 [`MAGIC`], u32 length of a JSON text, the JSON text, and the texture that this text
 //! describes. The text is a list; the entry of type `splat` in it has `size` (bytes of the texture), `texwidth` and
@@ -100,15 +100,15 @@ pub struct Splatv {
     /// Offset in bytes of the texture in the file.
     start: usize,
     count: usize,
-    /// Number of rows (Gaussians) that the texture should have, if the file ends before its texture does; otherwise
-    /// `None`.
+    /// Number of rows (Gaussians) of the texture that the header states, if the file ends before that many rows; `None`
+    /// if the file is complete.
     declared: Option<usize>,
     cameras: Value,
 }
 
 impl Splatv {
-    /// Opens the `.splatv` file at `path`. Rows of zeros at the end of the texture are padding, which some converters
-    /// leave out.
+    /// Opens the `.splatv` file at `path`. Rows that contain only zeros at the end of the texture are padding and are
+    /// not Gaussians. Some converters do not write these rows, so a file that ends before its texture is accepted.
     ///
     /// # Errors
     /// Fails if the first word is not [`MAGIC`], if the text is not a list with an entry of type `splat`, if the stated

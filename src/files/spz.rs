@@ -1,5 +1,5 @@
-//! `.spz` files: one frame of Gaussians (nianticlabs/spz, `load-spz.cc`). Versions 3 and 4 are written; versions 2, 3
-//! and 4 are read.
+//! Writes `.spz` files of versions 3 and 4 and reads those of versions 2, 3 and 4. A file holds one frame of Gaussians
+//! (nianticlabs/spz, `load-spz.cc`).
 //!
 //! | array | bytes per Gaussian | value |
 //! |---|---|---|
@@ -56,8 +56,8 @@ pub enum SpzVersion {
 pub struct SpzErrors {
     /// Largest error of a position, in scene units.
     pub position: f64,
-    /// Number of Gaussians with a scale that exceeds the maximum of the format by more than the usual error bound. The
-    /// file stores the maximum instead, which is still much larger than the scene.
+    /// Number of Gaussians with a scale above the maximum that the format can store. The file stores the maximum, which
+    /// is more than 1/10 too small. This is allowed, because it is still at least ten times as large as the scene.
     pub reduced_scales: usize,
 }
 
@@ -103,8 +103,8 @@ pub fn write_spz(state: &Gaussians, version: SpzVersion, path: &Path) -> Result<
     Ok(errors)
 }
 
-/// Writes an `.spz` file of version 3: the header `head` and the arrays of the Gaussians `state`, compressed together
-/// by gzip. Positions are stored in units of `unit`.
+/// Writes an `.spz` file of version 3 to `file`: the header `head` and the arrays of the Gaussians `state`, all
+/// compressed together by gzip. `unit` is the unit in which positions are stored, in scene units.
 fn write_gzip(head: &[u8], state: &Gaussians, unit: f64, file: impl Write) -> std::io::Result<()> {
     // Write no time stamp and no name into the gzip header, so that the same scene gives the same bytes.
     let mut out = GzBuilder::new().write(file, Compression::best());
@@ -114,9 +114,9 @@ fn write_gzip(head: &[u8], state: &Gaussians, unit: f64, file: impl Write) -> st
     out.get_mut().flush()
 }
 
-/// Writes an `.spz` file of version 4: the header, the table of sizes, and each array of the Gaussians `state` as a
-/// zstd frame. `head` returns the first 16 bytes of the header for a version and a number of arrays. Positions are
-/// stored in units of `unit`.
+/// Writes an `.spz` file of version 4 to `file`: the header, the table of sizes, and each array of the Gaussians
+/// `state` as a zstd frame. `head` receives the version and the number of arrays, and returns the first 16 bytes of the
+/// header. `unit` is the unit in which positions are stored, in scene units.
 fn write_streams(
     head: &dyn Fn(u32, usize) -> Vec<u8>,
     state: &Gaussians,
@@ -142,8 +142,8 @@ fn write_streams(
     file.flush()
 }
 
-/// Function that writes one array of an `.spz` file, such as the positions, for the given Gaussians. The second
-/// argument is the unit in which positions are stored.
+/// Function that writes one array of an `.spz` file, such as the positions of all Gaussians. The arguments are the
+/// Gaussians, the unit in which positions are stored (in scene units), and the output.
 type WriteArray = fn(&Gaussians, f64, &mut dyn Write) -> std::io::Result<()>;
 
 /// Functions that write the arrays of an `.spz` file, in the order of the file.
@@ -232,16 +232,17 @@ fn scale_byte(log_scale: f32) -> u8 {
     byte(16.0 * (f64::from(log_scale) + 10.0))
 }
 
-/// Returns the byte that stores the SH coefficient with index `k` (from 1) of one channel. Its value is rounded to 5
-/// bits in degree 1 and to 4 bits above.
+/// Returns the byte that stores the SH coefficient `value` above degree 0. `k` is its index among the coefficients of
+/// one color channel, from 1. The number 128·`value` + 128 is rounded to 5 bits in degree 1 and to 4 bits above.
 fn sh_byte(k: usize, value: f32) -> u8 {
     let step = if k < 4 { 8.0 } else { 16.0 };
     let nearest = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
     byte(nearest.floor() * step)
 }
 
-/// Encodes a unit quaternion xyzw in 32 bits: the index of its largest component, and the values of the other three. q
-/// and −q are the same rotation; the sign is chosen so that the omitted largest component is positive.
+/// Encodes a unit quaternion xyzw in 32 bits: the index of the component with the largest magnitude, and the values of
+/// the other three components. The omitted component is taken as positive, which is possible because q and −q are the
+/// same rotation.
 fn smallest_three(q: [f64; 4]) -> u32 {
     let largest = (1..4).fold(0, |largest: usize, i| if q[i].abs() > q[largest].abs() { i } else { largest });
     let others = (0..4).filter(|&i| i != largest);

@@ -1,4 +1,5 @@
-//! `.tsog` files, version 4 of the format (temporal SOG): moving Gaussians as lossless WebP images in a ZIP archive.
+//! Reads and writes `.tsog` files, version 4 of the format (temporal SOG), which hold moving Gaussians as lossless WebP
+//! images in a ZIP archive.
 //!
 //! An archive holds the images and the members of `meta.json` of a [`.sog`](super::sog) file, and also the members in
 //! the table. Time t runs from 0 to 1. Sources: the encoder of xiaomi-research/tsog, and the playback profile of
@@ -108,7 +109,7 @@ struct TimelineEntry {
     files: [String; 2],
 }
 
-/// Member `temporal` of `meta.json`: the motion of the Gaussians.
+/// Member `temporal` of `meta.json`: the motion of the Gaussians. Its member `means` describes the velocities.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Temporal {
@@ -141,8 +142,8 @@ struct OriginalTimes {
     times: [f64; 2],
 }
 
-/// Returns the number of 16-bit codes that stand for the same frame if a sequence has `frames` frames: 65,536 /
-/// `frames`, rounded down.
+/// Returns how many 16-bit codes stand for one frame in a timeline of type 0, in which each Gaussian is seen in a
+/// single frame: 65,536 / `frames`, rounded down. `frames` is the number of frames of the sequence.
 fn codes_per_frame(frames: usize) -> usize {
     (1 << 16) / frames.max(1)
 }

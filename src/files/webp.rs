@@ -1,5 +1,5 @@
-//! Lossless WebP images (VP8L) that hold numbers instead of colors: four bytes per pixel, all of them kept, also the
-//! colors of transparent pixels.
+//! Reads and writes lossless WebP images (VP8L) whose pixels hold numbers instead of colors. All four bytes of every
+//! pixel are kept exactly, even the colors of transparent pixels.
 
 use std::io::Cursor;
 

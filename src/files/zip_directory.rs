@@ -1,9 +1,10 @@
-//! Reads how many files a zip archive declares, so that this number can be checked before memory for the list of files
-//! is allocated.
+//! Reads the size of the list of files that a zip archive declares at its end. Readers of archives check it before they
+//! allocate memory for the list.
 
 use std::io::{Error, Read, Result, Seek, SeekFrom};
 
-/// Length in bytes of the record at the end of an archive, without the archive's comment.
+/// Length in bytes of the end record (end of central directory) of a zip archive, without the comment that may follow
+/// it.
 const END_BYTES: u64 = 22;
 /// Maximum length in bytes of the comment at the end of a zip archive.
 const MAX_COMMENT: u64 = 0xffff;
@@ -21,8 +22,9 @@ pub(crate) struct DeclaredDirectory {
     pub(crate) bytes: u64,
 }
 
-/// Reads from the records at the end of the zip archive `file` how large its list of files is. Finds these records in
-/// the same way as the crate `zip`.
+/// Reads the declared size of the list of files of the zip archive `file`, from the records at the end of the archive.
+/// Finds these records in the same way as the crate `zip`, so that the checked numbers are those that this crate will
+/// use.
 ///
 /// # Errors
 /// Fails if there are no such records, or if reading fails.

@@ -1,10 +1,10 @@
-//! Output for a zip writer that reports a failed write only once, when the output is closed.
+//! Output for a zip writer that remembers a failed write and reports it once, when the output is closed.
 
 use std::io::{self, Seek, SeekFrom, Write};
 
-/// Output for a zip writer that reports a failed write only in [`ZipOutput::close`]. After a failed write it accepts
-/// and discards all further bytes. The reason is that a zip writer that is dropped after an error still writes the
-/// archive's list of files and prints any error of this write.
+/// Output for a zip writer that reports a failed write only in [`ZipOutput::close`], and accepts and discards all bytes
+/// after the failure. This is necessary because a zip writer that is dropped after an error writes its list of files
+/// all the same, and prints any error of this write.
 pub(crate) struct ZipOutput<W> {
     inner: W,
     failed: Option<io::Error>,
@@ -27,8 +27,8 @@ impl<W: Write + Seek> ZipOutput<W> {
         self.failed.map_or(Ok(()), Err)
     }
 
-    /// Runs `done` on the inner output and returns its result. Returns `fallback` if an earlier operation failed or
-    /// `done` fails; the first error is kept for [`ZipOutput::close`].
+    /// Runs `done` on the inner output and returns its result. After a failure (now or in an earlier call), returns
+    /// `fallback` instead. The first error is kept for [`ZipOutput::close`].
     fn unless_failed<T>(&mut self, fallback: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
         if self.failed.is_some() {
             return fallback;

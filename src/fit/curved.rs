@@ -1,12 +1,16 @@
-//! Fit of curves to the track of a Gaussian. Each curve is visible in a soft window of time. Curves have one of two
-//! forms ([`CurveForm`]): cubic motion and linear rotation, which players of SpacetimeGaussians support, or linear
-//! motion and constant rotation.
+//! Fit of curves to the track of a Gaussian (its states at all frames). A curve is a Gaussian that moves along a
+//! polynomial of time and is visible in a soft window of time. Curves have one of two forms ([`CurveForm`]):
+//! - cubic motion and linear rotation, which players of SpacetimeGaussians support, or
+//! - linear motion and constant rotation.
 //!
-//! A window is exp(−((t − center)/width)²). A Gaussian with constant opacity and cubic motion needs one curve of
-//! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by overlapping curves: 3,
-//! 5, 9 … with cubic motion, or 2, 3, 4, 5, 7, 9 … with linear motion, which needs more of them. The centers of the
-//! windows are evenly spaced over the visible time, and each width is three quarters of the spacing. The sum of such
-//! windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%.
+//! A window is exp(−((t − center)/width)²). The number of curves depends on the Gaussian:
+//! - Constant opacity, and motion of the given form: one curve of infinite width.
+//! - Opacity that rises and fades once: one curve.
+//! - Any other Gaussian: overlapping curves, 3, 5, 9 … of them with cubic motion, or 2, 3, 4, 5, 7, 9 … with linear
+//!   motion, which needs more curves.
+//!
+//! The centers of overlapping windows are evenly spaced over the visible time, and each width is three quarters of the
+//! spacing. The sum of such windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%.
 //!
 //! Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the optical depth of the
 //! Gaussian is distributed among the curves, by multiplicative updates that keep all depths positive (Richardson 1972,
@@ -22,9 +26,11 @@ pub struct CubicTrack {
     pub center: f64,
     /// Width of the time window, in units of time; infinite for constant opacity.
     pub width: f64,
-    /// Coefficients of the position in scene units, from dt⁰ to dt³, where dt is the time since `center`.
+    /// Coefficients of the position, in scene units: `position[k]` is the coefficient of dtᵏ, where dt is the time
+    /// since `center`.
     pub position: [[f64; 3]; 4],
-    /// Coefficients of the rotation quaternion (w, x, y, z), dt⁰ and dt¹, where dt is the time since `center`.
+    /// Coefficients of the rotation quaternion (w, x, y, z): `rotation[k]` is the coefficient of dtᵏ, where dt is the
+    /// time since `center`.
     pub rotation: [[f64; 4]; 2],
     /// Natural logarithms of the three scales (scene units).
     pub log_scale: [f64; 3],
@@ -47,8 +53,8 @@ impl CubicTrack {
     }
 }
 
-/// Form of the curves that are fitted to a track: kind of motion, minimum width of time windows, and maximum number of
-/// curves.
+/// Form of the curves that are fitted to a track (states of a Gaussian at all frames): degree of the motion, minimum
+/// width of the time windows, and maximum number of curves.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurveForm {
     /// Whether positions are linear and rotations are constant in time. If not, positions are cubic and rotations are
@@ -100,9 +106,9 @@ const RIDGE: f64 = 1e-6;
 ///   [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
 
-/// Returns curves of the form `form` that represent `track`. Tries increasing numbers of curves, and returns the first
-/// curves that meet `tolerance` at every visible frame. If none do, returns the curves with the smallest error. Adds
-/// the errors of the returned curves to `misfit`.
+/// Returns curves of the form `form` that represent `track`, the states of a Gaussian at all frames. Tries increasing
+/// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame. If none do, returns
+/// the curves with the smallest error. Adds the errors of the returned curves to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,
@@ -145,8 +151,8 @@ fn depth(opacity: f64) -> f64 {
     -(-opacity.clamp(0.0, MAX_OPACITY)).ln_1p()
 }
 
-/// Returns one curve of the form `form` for `track`, with an infinitely wide window. Its opacity is constant: the mean
-/// over the visible frames.
+/// Returns one curve of the form `form` for `track` (states of a Gaussian at all frames), with an infinitely wide
+/// window. Its opacity is constant: the mean over the visible frames.
 fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_visible(frame));
@@ -155,9 +161,9 @@ fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
-/// Returns one curve for `track`. The logarithm of its opacity is a parabola in time, fitted to the visible frames with
-/// the squared opacity as weight. The fit is exact if the opacity of `track` is a time window, even if only a part of
-/// the window lies within the sequence.
+/// Returns one curve for `track` (states of a Gaussian at all frames). The logarithm of its opacity is a parabola in
+/// time, fitted to the visible frames with the squared opacity as weight. The fit is exact if the opacity of `track` is
+/// a time window, even if only a part of the window lies within the sequence.
 ///
 /// Returns `None` in these cases:
 /// - Fewer than three frames are visible.
@@ -187,8 +193,8 @@ fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     Some(CubicTrack { opacity: peak, ..curve })
 }
 
-/// Returns one curve for `track`. Its time window has the same mean and the same variance over time as the opacity of
-/// the track.
+/// Returns one curve for `track` (states of a Gaussian at all frames). Its time window has the same mean and the same
+/// variance over time as the opacity of the track.
 fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
@@ -209,8 +215,9 @@ fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
-/// Returns `count` + 1 overlapping curves of the form `form` for `track`. The centers of their time windows are evenly
-/// spaced from the time `start` to the time `end`, between which the Gaussian is visible.
+/// Returns `count` + 1 overlapping curves of the form `form` for `track` (states of a Gaussian at all frames). The
+/// centers of their time windows are evenly spaced from the time `start` to the time `end`, between which the Gaussian
+/// is visible.
 fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = WIDTH_PER_INTERVAL * apart;
@@ -254,9 +261,10 @@ fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 
     depths.into_iter().enumerate().map(curve).collect()
 }
 
-/// Returns a curve of the form `form` that follows the position and rotation of `track` by least squares. Its time
-/// window has the center `center` and the width `width`. The weight of a frame is its opacity times `weight(frame)`.
-/// Scales and SH coefficients are weighted means. The opacity of the curve is left at 0, for the caller to set.
+/// Returns a curve of the form `form` that follows the position and rotation of `track` (states of a Gaussian at all
+/// frames) by least squares. Its time window has the center `center` and the width `width`. The weight of a frame is
+/// its opacity times `weight(frame)`. Scales and SH coefficients are weighted means. The opacity of the curve is left
+/// at 0, for the caller to set.
 fn fit_motion(
     track: &FittedTrack,
     form: CurveForm,
@@ -297,10 +305,12 @@ fn fit_motion(
     }
 }
 
-/// Compares `curves` with `track` at all frames in which the Gaussian or a curve is visible. Returns two results:
-/// - The largest error, divided by its tolerance in `tolerance`; at most 1 if the curves meet the tolerance. Errors
-///   that are NaN do not count. The error of each curve is multiplied by its share of the optical depth, so a curve
-///   that is hardly visible at a frame need not be close to the Gaussian there.
+/// Compares `curves` with `track`, the states of a Gaussian, at all frames in which the Gaussian or a curve is visible.
+/// Returns two results:
+/// - The largest ratio of an error to its tolerance in `tolerance`. It is at most 1 if the curves meet the tolerance.
+///   Errors that are NaN are ignored. The errors of a curve are multiplied by the fraction of the Gaussian's optical
+///   depth that the curve has at the frame. So a curve that is hardly visible at a frame need not be close to the
+///   Gaussian there.
 /// - The errors over all these frames, in their own units.
 fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, FitError) {
     let (mut worst, mut misfit) = (0.0f64, FitError::default());

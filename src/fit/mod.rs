@@ -29,14 +29,15 @@ pub struct Tolerance {
     pub opacity: f64,
     /// Largest allowed difference between the SH coefficients of the fit and of the Gaussian.
     pub sh: f64,
-    /// Lowest opacity of a Gaussian for which the tolerances apply as given. For a Gaussian of a lower opacity α, every
-    /// tolerance except that of the opacity is multiplied by `full_opacity`/α. If this value is 0, the tolerances apply
-    /// as given to every Gaussian. Used by [`curved`] only.
+    /// Opacity from which on the tolerances apply as given. For a Gaussian of a lower opacity α, every tolerance except
+    /// that of the opacity is multiplied by `full_opacity`/α, because errors of faint Gaussians are less visible. The
+    /// value 0 means that the tolerances apply as given to every Gaussian. Used by [`curved`] only.
     pub full_opacity: f64,
 }
 
 impl Tolerance {
-    /// Tolerances of a compact fit by [`curved`]: a Gaussian may be off by half of its middle scale.
+    /// Tolerances of the compact fit by [`curved`], which takes few curves: for example, a Gaussian may be off by half
+    /// of its middle scale.
     pub const COMPACT: Tolerance =
         Tolerance { position: 0.5, rotation: 0.3, log_scale: 0.2, opacity: 0.06, sh: 0.2, full_opacity: 1.0 / 3.0 };
 
@@ -55,8 +56,8 @@ impl Default for Tolerance {
     }
 }
 
-/// Errors beyond which a fitted Gaussian counts as far off: the error of its position, in units of its middle scale,
-/// and the error of its opacity.
+/// Errors beyond which a fitted Gaussian counts as far off. First: error of its position, in units of its middle scale.
+/// Second: error of its opacity.
 const FAR: [f64; 2] = [1.0, 0.1];
 
 /// Errors of fitted motions (curves, or pieces of linear motion) compared with the original states of the Gaussians,

@@ -1,11 +1,12 @@
-//! Fit of pieces with linear motion to the track of a Gaussian. All other attributes are constant within a piece.
+//! Fit of pieces with linear motion to the track of a Gaussian (its states at all frames). Within a piece, all
+//! attributes other than the position are constant.
 
 use std::ops::Range;
 
 use super::least_squares::polynomial;
 use super::{FitError, FittedTrack, Tolerance};
 
-/// Piece of a track: linear motion of a Gaussian during consecutive frames.
+/// Piece of a track (states of a Gaussian at all frames): linear motion of the Gaussian during consecutive frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LinearPiece {
     /// Frames in which the piece represents the Gaussian.
@@ -22,15 +23,18 @@ pub struct LinearPiece {
     pub log_scale: [f64; 3],
     /// Opacity in [0, 1].
     pub opacity: f64,
-    /// SH coefficients.
+    /// SH coefficients of the Gaussian, constant within the piece.
     pub sh: Vec<f32>,
 }
 
-/// Divides `track` into pieces of linear motion, and adds their errors to `misfit`. Returns the pieces in order of
-/// time. Each piece covers a span of 2ᵏ frames that begins at a multiple of 2ᵏ: the whole sequence, one of its halves,
-/// one of its quarters and so on. Therefore all Gaussians together have at most twice as many different spans as there
-/// are frames. A piece covers the largest span in which it meets `tolerance` at every frame. Frames in which the
-/// Gaussian is invisible have no piece.
+/// Divides `track` (states of a Gaussian at all frames) into pieces of linear motion and returns them in order of time.
+/// Adds the errors of the pieces to `misfit`.
+///
+/// - Each piece covers a span of 2ᵏ frames that begins at a multiple of 2ᵏ: the whole sequence, one of its halves, one
+///   of its quarters and so on. Therefore all Gaussians together have at most twice as many different spans as there
+///   are frames.
+/// - A piece covers the largest such span in which it meets `tolerance` at every frame.
+/// - Frames in which the Gaussian is invisible have no piece.
 pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitError) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
     add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
@@ -46,9 +50,9 @@ pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitErr
     pieces
 }
 
-/// Fits pieces of linear motion to the frames `span` of `track`, and appends them to `pieces`. Halves the span if one
-/// piece would differ from the track by more than `tolerance`, or if the Gaussian is invisible in some frames of the
-/// span. A span has 2ᵏ frames and may extend beyond the last frame of the track.
+/// Fits pieces of linear motion to the frames `span` of `track` (states of a Gaussian at all frames), and appends them
+/// to `pieces`. Halves the span if one piece would differ from the track by more than `tolerance`, or if the Gaussian
+/// is invisible in some frames of the span. A span has 2ᵏ frames and may extend beyond the last frame of the track.
 fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_visible(frame)).count();
@@ -71,8 +75,8 @@ fn position_at(piece: &LinearPiece, time: f64) -> [f64; 3] {
     std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
 }
 
-/// Returns the best piece for `frames` of `track`: a least squares fit of the positions, and the means of all other
-/// attributes.
+/// Returns the best piece of linear motion for `frames` of `track` (states of a Gaussian at all frames): a least
+/// squares fit of the positions, and the means of all other attributes.
 fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let count = frames.len() as f64;
     let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
@@ -96,7 +100,8 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     }
 }
 
-/// Returns whether `piece` differs from `track` by at most `tolerance` at every frame of the piece.
+/// Returns whether `piece` (linear motion) differs from `track` (states of a Gaussian at all frames) by at most
+/// `tolerance` at every frame of the piece.
 fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
@@ -112,7 +117,8 @@ fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) ->
 mod tests {
     use super::*;
 
-    /// Returns the track of a round Gaussian of scale e⁻³, with its position and opacity given as functions of time.
+    /// Returns the track (states at all frames) of a round Gaussian of scale e⁻³, with its position and opacity given
+    /// as functions of time.
     pub(super) fn track(
         frames: usize,
         position: impl Fn(f64) -> [f64; 3],

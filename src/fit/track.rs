@@ -1,4 +1,4 @@
-//! Track of one Gaussian: its attributes at every frame.
+//! Type [`FittedTrack`]: the track of one Gaussian, that is, its attributes at every frame.
 
 use crate::model::{Gaussians, opacity};
 
@@ -24,7 +24,8 @@ pub struct FittedTrack {
 }
 
 impl FittedTrack {
-    /// Returns the track of the Gaussian in row `row` of `states`. `states` holds all Gaussians at each of the `times`.
+    /// Returns the track (states at all frames) of the Gaussian in row `row` of `states`. `states` holds all Gaussians
+    /// at each of the `times`.
     pub fn from_states(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];

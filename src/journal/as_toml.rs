@@ -1,4 +1,4 @@
-//! Storage of summaries of stages in cache entries (files with the result of a stage).
+//! Wrapper [`AsToml`], with which summaries of stages are stored in cache entries (files with the result of a stage).
 
 use serde::de::{DeserializeOwned, Error as _};
 use serde::ser::Error as _;

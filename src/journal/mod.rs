@@ -1,5 +1,5 @@
-//! Journal of a run: its stages with their time, memory and reads, omitted stages with reasons, and notes. An entry is
-//! added where the work is done.
+//! Journal of a run: records of its stages with their time, memory and reads, omitted stages with reasons, and notes.
+//! The code that does a piece of work adds the entry for it.
 
 pub(crate) mod as_toml;
 pub mod records;
@@ -55,8 +55,8 @@ fn processor_seconds() -> Option<f64> {
 /// Journal: record of the stages of a run so far, or of one stage whose result is in the cache.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
-    /// Amounts of data (bytes, tiles, states) that one full read of the input takes, in which every frame is read once.
-    /// The reads of a stage are reported as a multiple of these amounts.
+    /// Amounts that one full read of the input (every frame once) takes: bytes, tiles (compressed blocks of values) and
+    /// states (one Gaussian at one frame). The reads of a stage are reported as a multiple of these amounts.
     #[serde(skip)]
     pub whole: Reads,
     /// Records of the stages that have run, in order.
@@ -76,9 +76,9 @@ pub struct Journal {
 }
 
 impl Journal {
-    /// Runs `work` as the stage `name` and records its time, memory, and reads of `source`. `gaussians_in` is the
-    /// number of Gaussians before the stage. `work` returns its result and the number of Gaussians after the stage.
-    /// Returns the result.
+    /// Runs the stage `name`, whose work is the function `work`, and returns its result. Records the time, the memory,
+    /// and the reads of `source`. `gaussians_in` is the number of Gaussians before the stage. `work` returns its result
+    /// together with the number of Gaussians after the stage.
     ///
     /// # Errors
     /// Fails if `work` fails; the stage is not recorded then.
@@ -97,13 +97,15 @@ impl Journal {
     }
 
     /// Returns the result of the stage `name` from the cache of `scene`. If the cache has no result for `key`, runs the
-    /// stage with `compute` like [`Journal::run_stage`], and stores the result under `key`. The stage cannot be divided
-    /// among processes.
+    /// stage with `compute` as [`Journal::run_stage`] does, and stores the result under `key`. Only for stages that one
+    /// process runs as a whole.
     ///
     /// # Errors
-    /// Fails if `compute` fails, or if the cache cannot be read or written. If the run is limited to one shard (part of
-    /// a divided stage) and the result is not in the cache, fails with
-    /// [`Error::ShardDone`](crate::error::Error::ShardDone), which ends the run.
+    /// Fails in these cases:
+    /// - `compute` fails.
+    /// - The cache cannot be read or written.
+    /// - The run is limited to one shard (part of a divided stage), and the result is not in the cache. The error is
+    ///   then [`Error::ShardDone`](crate::error::Error::ShardDone), which ends the run.
     pub fn run_cached_stage<T: Serialize + DeserializeOwned>(
         &mut self,
         name: &'static str,
@@ -126,9 +128,9 @@ impl Journal {
         bands.or(field).or(self.refined.map(|refined| refined.result))
     }
 
-    /// Returns the result of `stage` for `key` from the cache `work`, or computes and stores it. `compute` records its
-    /// stages and notes in a journal of its own. They are stored with the result and added to this journal, also when
-    /// the result comes from the cache.
+    /// Returns the result of the stage `stage` for `key` from the cache `work`. If the cache has none, runs `compute`
+    /// and stores its result. The stages and notes that `compute` records are stored together with the result. They are
+    /// added to this journal (record of the run) even if the result comes from the cache.
     ///
     /// # Errors
     /// Fails if `compute` fails or the cache cannot be used.
@@ -170,7 +172,8 @@ impl Journal {
         self.left_out.push(OmittedWork { what: what.into(), why: why.into(), saved: None });
     }
 
-    /// Adds an entry for the omitted work `what` with the reason `why` and the saved cost `saved`.
+    /// Adds an entry for the omitted work `what` with the reason `why` and `saved`, the cost that it would have had
+    /// (time and reads).
     pub fn leave_out_with_saving(&mut self, what: impl Into<String>, why: impl Into<String>, saved: SavedCost) {
         self.left_out.push(OmittedWork { what: what.into(), why: why.into(), saved: Some(saved) });
     }

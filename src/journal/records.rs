@@ -48,7 +48,7 @@ pub struct OmittedWork {
     pub saved: Option<SavedCost>,
 }
 
-/// Cost that was saved because work was omitted.
+/// Cost (time and reads, or bytes) that was saved because work was omitted.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SavedCost {
@@ -59,7 +59,7 @@ pub enum SavedCost {
         /// Maximum amount that the stage would have read, in full reads (every frame of the input once).
         reads: f64,
     },
-    /// Values of attributes that are the same in every frame and were therefore not read again.
+    /// Cost of values that were not read again, because their attributes are the same in every frame.
     Values {
         /// Number of bytes of the values that were not read again.
         bytes: u64,
@@ -77,7 +77,7 @@ impl SavedCost {
 }
 
 impl OmittedWork {
-    /// Returns the reason and the saved cost as text for display.
+    /// Returns the reason why work was omitted and the saved cost (time and reads, or bytes) as text for display.
     pub fn reason(&self) -> String {
         match self.saved {
             Some(saved) => format!("{}; saves {}", self.why, saved.text()),

@@ -5,8 +5,8 @@ use bytesize::ByteSize;
 use crate::limits::ReadLimit;
 use crate::machine::{memory_limit, peak_memory_bytes};
 
-/// Bytes of memory that a run takes without any Gaussian: the program (12.5 MiB without optimization), its libraries
-/// (3.6 MiB), stacks and heaps of its threads, and messages.
+/// Bytes of memory that a run takes without any Gaussian: the program (12.5 MiB if it is compiled without
+/// optimization), its libraries (3.6 MiB), stacks and heaps of its threads, and messages.
 pub(super) const PROGRAM_BYTES: u64 = 18 << 20;
 /// Bytes of memory that each thread takes in addition to [`PROGRAM_BYTES`].
 pub(super) const PER_THREAD: u64 = 2 << 20;

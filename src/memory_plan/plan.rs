@@ -11,15 +11,17 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::VIEWS_PER_THREAD;
 use crate::progress::{Events, Message, format_duration};
 
-/// Number by which the memory budget is divided to limit the memory for decoded tiles (values of consecutive Gaussians
-/// × frames) of a container. If all decoded tiles fit into this 1/16 of the budget, they stay in memory. Otherwise a
-/// tile is decoded again whenever it is needed, from stored bytes that the file system caches anyway. More memory for
-/// tiles would thus save only decoding time, and leave less memory to other processes.
+/// Divisor of the memory budget that gives the limit on the memory for decoded tiles of a container: 1/16 of the
+/// budget. A tile holds the values of consecutive Gaussians at consecutive frames.
+/// - If all decoded tiles together fit into the limit, they stay in memory.
+/// - If they do not, each tile is decoded again whenever it is needed. The file system caches the stored bytes anyway.
+///
+/// More memory for tiles would thus save only decoding time, and leave less memory to other processes.
 const HELD_TILES_DIVISOR: u64 = 16;
 
-/// Functions, each of which halves one of the limits on what stages keep in memory at a time. Halving a limit slows a
-/// run; the functions that slow it most come first. If several functions free equally much memory, the last of them is
-/// chosen.
+/// Functions to reduce the memory of a run. Each halves one of the limits on what stages keep in memory at a time,
+/// which slows the run. The functions that slow it most come first. If several functions free equally much memory, the
+/// last of them is chosen.
 const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { views_together: limits.views_together.div_ceil(2), ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
@@ -40,8 +42,8 @@ pub struct MemoryPlan {
 
 impl MemoryPlan {
     /// Finds the fastest limits under which all stages fit into `budget`, and returns the plan with them. `estimates`
-    /// returns the estimates of all stages for given limits. Sends the plan as text to `events` if the budget asks for
-    /// it, even if the stages do not fit.
+    /// returns the estimates of all stages for given limits. If the user asked for the plan ([`Verbosity::Plan`]),
+    /// sends it as text to `events`, even if the stages do not fit.
     ///
     /// # Errors
     /// Fails if the stages do not fit under any limits; the error states the smallest sufficient budget.
@@ -59,9 +61,9 @@ impl MemoryPlan {
         if fits { Ok(plan) } else { Err(plan.too_small_error(budget)) }
     }
 
-    /// Returns whether all stages can fit into the memory budget `budget` if the amounts that they keep in memory at a
-    /// time (frames, views, Gaussians; see [`Limits`]) are limited far enough. `estimates` returns the estimates of all
-    /// stages for given limits.
+    /// Returns whether there are limits under which all stages fit into the memory budget `budget`. A limit is a
+    /// maximum amount (frames, views, Gaussians; see [`Limits`]) that stages keep in memory at a time. `estimates`
+    /// returns the estimates of all stages for given limits.
     pub fn fits_budget(
         work: Workload,
         budget: Budget,
@@ -118,9 +120,11 @@ impl MemoryPlan {
         }
     }
 
-    /// Returns this plan, in which decoded tiles (values of consecutive Gaussians × frames) of the container may stay
-    /// in memory if all of them fit and take only a small part of the budget ([`HELD_TILES_DIVISOR`]). No tile is then
-    /// read twice.
+    /// Returns this plan, with [`Limits::keeps_tiles`] set if all decoded tiles of the container may stay in memory, so
+    /// that no tile is read twice. A tile holds the values of consecutive Gaussians at consecutive frames. Two
+    /// conditions must hold:
+    /// - The memory budget suffices for all stages and the decoded tiles together.
+    /// - The decoded tiles take at most the budget divided by [`HELD_TILES_DIVISOR`].
     fn with_held_tiles(mut self) -> MemoryPlan {
         let decoded = self.work.input.decoded;
         let fits = self.excess_bytes() == 0 && self.peak_bytes().saturating_add(decoded) <= self.budget;
@@ -147,8 +151,9 @@ impl MemoryPlan {
         PROGRAM_BYTES + PER_THREAD * self.work.threads + self.work.known_bytes() + held
     }
 
-    /// Returns the number of bytes by which each stage exceeds the memory budget, summed over all stages; 0 if all
-    /// stages fit.
+    /// Returns the number of bytes by which memory exceeds the budget: the excess of each stage, summed over all
+    /// stages, plus the excess of the memory that every stage needs ([`MemoryPlan::base`]). Returns 0 if all stages
+    /// fit.
     fn excess_bytes(&self) -> u64 {
         let available = self.budget.saturating_sub(self.base());
         let beyond = self.estimates.iter().map(|estimate| estimate.bytes(&self.work).saturating_sub(available));

@@ -11,10 +11,12 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::{GAUSSIANS_PER_BLOCK, VIEWS_PER_THREAD};
 use crate::render;
 
-/// Bytes of memory per tile of an open container: a flag that tells whether the tile's checksum has been verified.
+/// Bytes of memory per tile (stored block of values) of an open container: a flag that tells whether the tile's
+/// checksum has been verified.
 const PER_TILE: u64 = 1;
-/// Bytes of memory for each column (attribute) and block of Gaussians of a container that is open or being written: the
-/// index entry of its last tile whose values are constant in time.
+/// Bytes of memory for each pair of a column (attribute) and a block of Gaussians, in a container that is open or being
+/// written. They hold the index entry of the last constant tile of this pair: a stored block whose values are the same
+/// at all its frames.
 const PER_SLOT: u64 = 80;
 /// Bytes of memory per frame of a container that is being written: its time stamp (8 bytes), counted twice because the
 /// list of time stamps grows by being copied to twice its length.
@@ -45,7 +47,7 @@ pub struct Workload {
     pub varying: Attributes,
     /// Memory that the input and its readers take, and numbers of frames and Gaussians per tile of the input.
     pub input: MemoryProfile,
-    /// Number of distinct view numbers among the views of all cameras.
+    /// Number of viewpoints: different view numbers among the views of all cameras.
     pub viewpoints: u64,
     /// Number of pixels per image of the camera with the largest images.
     pub pixels: u64,
@@ -141,10 +143,11 @@ impl Workload {
         state_bytes(self.sh_degree, columns)
     }
 
-    /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps for
-    /// later reads. Let n be the smaller of [`Limits::max_kept_frames`] and the frames per tile (stored block) of the
-    /// input. The reader keeps n + 2 frames, or none if n is at most 1. Attributes that do not vary in time are not
-    /// counted.
+    /// Returns the memory, in bytes per Gaussian, of the decoded frames that a reader of the attributes `columns` keeps
+    /// for later reads. Attributes that do not vary in time are not counted.
+    ///
+    /// Let n be the smaller of [`Limits::max_kept_frames`] and the number of frames per tile (stored block) of the
+    /// input. If n is at least 2, the reader keeps n + 2 frames. If n is 0 or 1, it keeps none.
     pub fn kept_frames_bytes(&self, limits: &Limits, columns: Attributes) -> u64 {
         let frames = match (limits.max_kept_frames as u64).min(self.input.frame_block) {
             0..=1 => 0,
@@ -153,8 +156,8 @@ impl Workload {
         frames * self.state_bytes(columns & self.varying)
     }
 
-    /// Returns the memory that the readers of all threads take while each thread fills one block of Gaussians with
-    /// values. Includes the buffers for decoding tiles (stored blocks of values).
+    /// Returns the memory of all readers while each thread fills one block of Gaussians with values, with the buffers
+    /// in which the readers decode tiles (stored blocks of values).
     pub fn block_buffer_memory(&self) -> MemoryPart {
         let block =
             self.largest_block(GAUSSIANS_PER_BLOCK as u64) * (self.state_bytes(Attributes::all()) + self.input.reader);
@@ -222,9 +225,10 @@ impl Workload {
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
-    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames; below 1
-    /// if only a part of the input is read. A tile (stored block of Gaussians × frames) is always read as a whole. It
-    /// is read several times if the memory limit lets readers keep only some of its frames.
+    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames. The
+    /// number is below 1 if only a part of the input is read. A tile (stored block of Gaussians × frames) is always
+    /// read as a whole. It is read several times if [`Limits::max_kept_frames`] lets readers keep only some of its
+    /// frames.
     pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
@@ -245,7 +249,7 @@ impl Workload {
     }
 
     /// Returns the time in seconds on one processor core for rendering `pictures` views of `gaussians` Gaussians. The
-    /// [`RenderCost`] gives the time of one view per Gaussian and per pixel.
+    /// last argument, a [`RenderCost`], gives the time of one view per Gaussian and per pixel.
     pub fn render_seconds(
         &self,
         pictures: f64,
@@ -261,7 +265,8 @@ impl Workload {
         Workload { pixels: self.pixels / u64::from(stride.get()).pow(2), ..*self }
     }
 
-    /// Returns the time in seconds on one processor core for reading `gaussians` Gaussians at `frames` frames.
+    /// Returns the time in seconds on one processor core for reading the states of `gaussians` Gaussians at `frames`
+    /// frames each.
     pub fn reading_seconds(&self, gaussians: f64, frames: f64) -> f64 {
         self.throughput.states * gaussians * frames * self.input.seconds_per_state
     }

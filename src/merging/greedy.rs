@@ -13,15 +13,16 @@
 
 use rayon::prelude::*;
 
-/// Number of parallel rounds after which all nodes (Gaussians or merged groups) that still have no leader are assigned
-/// sequentially. Scenes need 5 to 8 rounds. A chain of Gaussians that are ranked in their order along a line would need
-/// one round for every two Gaussians.
+/// Maximum number of parallel rounds. Nodes (Gaussians or merged groups) that have no leader (node that they join)
+/// after the last round are assigned sequentially. Scenes need 5 to 8 rounds. A chain of Gaussians that are ranked in
+/// their order along a line would need one round for every two Gaussians.
 const MAX_ROUNDS: usize = 32;
-/// Number of nodes without a leader below which it is faster to assign them sequentially than in another parallel
-/// round. A node is a Gaussian or a merged group.
+/// Number of nodes (Gaussians or merged groups) below which it is faster to assign them to their leaders (the nodes
+/// that they join) sequentially than in another parallel round.
 const FEW: usize = 64;
 
-/// Leader of every node (Gaussian or merged group), and statistics of how the leaders were found.
+/// Result of clustering: for every node (Gaussian or merged group) its leader, which is the node that it joins or
+/// itself, and statistics of how the leaders were found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Clustering {
     /// Index of the leader of every node (Gaussian or merged group): the node that it joined, or the node itself if it
@@ -32,13 +33,14 @@ pub struct Clustering {
     /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
     /// they join).
     pub rounds: usize,
-    /// Whether some nodes (Gaussians or merged groups) had no leader after the last parallel round and were assigned
-    /// sequentially.
+    /// Whether some nodes (Gaussians or merged groups) were assigned to leaders (the nodes that they join)
+    /// sequentially, after the last parallel round.
     pub sequential: bool,
 }
 
-/// Returns the rank of every node (Gaussian or merged group), a permutation of 0..N. Nodes are ranked by descending
-/// `size`; ties by ascending `hash`, then by index.
+/// Returns the rank of every node (Gaussian or merged group), from 0: its position in the order in which the greedy
+/// rule visits the nodes. `size` holds the importance of every node. Nodes are ordered by descending `size`; ties by
+/// ascending `hash`, then by index.
 ///
 /// A size that is NaN counts as the smallest; −0 equals 0.
 pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
@@ -55,15 +57,17 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
     rank
 }
 
-/// Value in `leader_of` of a node that has no leader yet. For all other nodes the value is the index of the leader.
+/// Value in `leader_of` of a node that has no leader yet. For all other nodes the value is the index of the leader: the
+/// node into which the node is merged, or the node itself.
 const UNDECIDED: u32 = u32::MAX;
 
-/// Assigns every node (Gaussian or merged group) to a leader (the node that it joins, or itself) by the sequential
-/// greedy rule of this module, and returns the assignment. `rank`: rank of every node, a permutation of 0..N. `pairs`:
-/// pairs (leader, member) that passed all tests, in any order, in which the leader has the lower rank.
+/// Assigns every node (Gaussian or merged group) to a leader by the sequential greedy rule of this module: the node
+/// that it joins, or itself. Returns the assignment.
 ///
-/// With `limit`, only the first `limit` joins are made, in the order of the leader's rank, then of the member's. The
-/// members of all later joins stay single.
+/// - `rank`: rank of every node, a permutation of 0..N;
+/// - `pairs`: pairs (leader, member) that passed all tests, in any order; the leader has the lower rank;
+/// - `limit`: maximum number of joins. Only the first joins are made, in the order of the leader's rank, then of the
+///   member's. The members of all later joins stay single.
 pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Clustering {
     let predecessors = Predecessors::new(rank, pairs);
     let mut leader_of = vec![UNDECIDED; rank.len()];
@@ -93,7 +97,8 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
 /// For every node (Gaussian or merged group), the nodes of lower rank that could become its leader.
 struct Predecessors {
     start: Vec<usize>,
-    /// Pairs (possible leader, node), sorted by node, then by the rank of the possible leader.
+    /// Pairs (possible leader, node), where the leader is the node that the other may join. Sorted by node, then by the
+    /// rank of the possible leader.
     pairs: Vec<(u32, u32)>,
 }
 
@@ -110,9 +115,8 @@ impl Predecessors {
         Predecessors { start, pairs }
     }
 
-    /// Returns the leader of `node` (itself if it becomes a leader). Returns `None` if the leader depends on a
-    /// predecessor that has no leader in `leader_of` yet. Predecessors are the nodes of lower rank that could take
-    /// `node`.
+    /// Returns the leader of `node`: the node that it joins, or itself. Returns `None` if this cannot be decided yet,
+    /// because a predecessor (node of lower rank that could take `node`) has no leader in `leader_of`.
     fn decide(&self, node: u32, leader_of: &[u32]) -> Option<u32> {
         let candidates = &self.pairs[self.start[node as usize]..self.start[node as usize + 1]];
         for &(predecessor, _) in candidates {
@@ -126,8 +130,8 @@ impl Predecessors {
     }
 }
 
-/// Undoes all joins in `leader_of` except the first `limit` in sequential order: by the `rank` of the leader, then of
-/// the member. Without `limit`, undoes none. Returns the number of joins that remain.
+/// Undoes all joins in `leader_of` except the first `limit`, ordered by the `rank` of the leader (node that another
+/// joins), then of the node that joins it. Without `limit`, undoes none. Returns the number of joins that remain.
 fn truncate(rank: &[u32], leader_of: &mut [u32], limit: Option<usize>) -> usize {
     let joined = |(node, &leader): (usize, &u32)| (node as u32 != leader).then_some(node as u32);
     let all = leader_of.iter().enumerate().filter_map(joined).count();

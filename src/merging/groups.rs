@@ -1,7 +1,8 @@
 //! Groups of Gaussians that merging has joined, each with a leader: the Gaussian into which the others are merged.
 
 /// Partition of the survivors (Gaussians left by pruning) into groups. A Gaussian is identified by its row in the table
-/// of survivors. Groups are ordered by the row of their leader. Memory: at most 12 bytes per row.
+/// of survivors. Groups are ordered by the row of their leader, the Gaussian into which the others are merged. Memory:
+/// at most 12 bytes per row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MergeGroups {
     leaders: Vec<u32>,
@@ -15,9 +16,9 @@ impl MergeGroups {
         MergeGroups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
-    /// Joins every group g to the group `leader_of[g]`, and returns the resulting groups. If `leader_of[g]` is g
-    /// itself, group g joins no other group, but others may join it. A combined group has the leader of the group that
-    /// the others joined.
+    /// Merges groups with one another, and returns the resulting groups. `leader_of[g]` is the index of the group that
+    /// group g joins, or g itself if it joins none. A resulting group has the leader (Gaussian into which the others
+    /// are merged) of the group that the others joined.
     pub fn joined(&self, leader_of: &[u32]) -> Self {
         let mut new_index = vec![0; leader_of.len()];
         let mut leaders = Vec::new();

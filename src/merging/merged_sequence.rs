@@ -18,11 +18,13 @@ use crate::passes::FrameReaders;
 use crate::recipe::{MergeParams, ProxyPosition};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Attributes of a proxy that cannot be computed separately: moments mix position, rotation and scale, and opacity
-/// depends on areas.
+/// Attributes of a proxy (Gaussian that replaces a merged cluster) that are always computed together: all except SH.
+/// Position, rotation and scale follow from the moments (mean and covariance) of the members, and the opacity from
+/// their areas.
 const MIXED: Attributes = Attributes::all().difference(Attributes::SH);
 
-/// Number of proxies that are computed before their values are written to the output.
+/// Number of proxies (Gaussians that replace merged clusters) that are computed before their values are written to the
+/// output.
 const BATCH: usize = 4096;
 
 /// Sequence of the survivors (Gaussians left by pruning) of a source, in which a proxy replaces each merged cluster.
@@ -40,9 +42,10 @@ pub struct MergedSequence<'a> {
 
 impl<'a> MergedSequence<'a> {
     /// Creates the sequence of the Gaussians `survivors` of `source`, some of which are replaced by proxies. `clusters`
-    /// yields for each proxy the index in `survivors` of the Gaussian it replaces (its leader), and the ids and weights
-    /// of its members. Proxies are computed by the parameters `merge`, but always placed at the mean of their members:
-    /// their position is computed anew at every frame, so they need not move with the leader.
+    /// yields for each proxy the index in `survivors` of the Gaussian that it replaces (the leader of its cluster),
+    /// then the ids and weights of the cluster's members. `merge`: parameters by which proxies are computed, except for
+    /// their position. A proxy is always at the mean of its members: its position is computed anew at every frame, so
+    /// it need not move with the leader.
     pub fn new(
         source: &'a dyn FrameSource,
         survivors: &'a [u32],
@@ -69,8 +72,9 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. If there are proxies among
-    /// them, reads the members of all these proxies together, on all threads. Fails if a Gaussian cannot be read.
+    /// Opens a reader of the Gaussians with the indices `places` in this sequence, at the frames `wanted`. A proxy
+    /// (Gaussian that replaces a merged cluster) is computed from its members (the Gaussians of the cluster); the
+    /// members of all proxies among `places` are read together, on all threads. Fails if a Gaussian cannot be read.
     ///
     /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
     pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
@@ -79,8 +83,8 @@ impl MergedSequence<'_> {
         Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
-    /// Returns the number of source Gaussians that the Gaussian with index `place` of this sequence replaces: the
-    /// members of its cluster if it is a proxy, otherwise 1.
+    /// Returns the number of source Gaussians that the Gaussian with index `place` of this sequence replaces: the size
+    /// of its merged cluster if it is a proxy (Gaussian that replaces a merged cluster), otherwise 1.
     pub fn member_count(&self, place: usize) -> usize {
         self.members[place].len().max(1)
     }
@@ -114,8 +118,8 @@ struct MergedMembers {
     /// member).
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
-    /// For every member of every proxy, the index of its id in `ids`, and its weight. The members of one proxy follow
-    /// one another.
+    /// For every proxy (Gaussian that replaces a cluster) and every member of its cluster: the index of the member's id
+    /// in `ids`, then the weight of the member. The members of one proxy follow one another.
     members: Vec<(u32, f64)>,
 }
 
@@ -143,13 +147,15 @@ impl MergedMembers {
         MergedMembers { ids, rows, proxies, members }
     }
 
-    /// Returns the attributes of the source Gaussians that are needed to compute the attributes `want` of the sequence.
+    /// Returns the attributes of the source Gaussians that are needed to compute the attributes `want` of the selected
+    /// Gaussians. If some of these are proxies (Gaussians that replace clusters), [`MIXED`] is needed in addition to
+    /// `want`.
     fn needed(&self, want: Attributes) -> Attributes {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
     /// Computes the attributes `want` of the selected Gaussians from the source Gaussians `state`, by the parameters
-    /// `merge` for proxies, and writes them to `out`.
+    /// `merge` for proxies (Gaussians that replace merged clusters), and writes them to `out`.
     fn write(&self, state: &Gaussians, want: Attributes, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.column(column), out.column_mut(column));

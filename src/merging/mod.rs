@@ -48,9 +48,10 @@ use tree::TreePoint;
 /// coincident nodes (24), and the clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
-/// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
-/// its copy in the list of pairs to measure, two known similarities ([`similarity_cache::SimilarityCache`]; one for
-/// this pair and one for a pair of an earlier pass), and the motion similarity that is returned.
+/// Bytes of memory per candidate pair in one call of `measure`, the callback that measures the motion of pairs; memory
+/// that the callback itself takes is not included. The terms are the pair, its copy in the list of pairs to measure,
+/// two entries of the [`similarity_cache::SimilarityCache`] (one for this pair, one for a pair of an earlier pass), and
+/// the motion similarity that is returned.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * BYTES_PER_CACHED_PAIR + size_of::<f64>();
 
 /// Bytes of memory per pair that passed all tests of a merging pass: the pair, and 4 bytes of spare capacity of the
@@ -64,12 +65,12 @@ const CHUNK: usize = 1024;
 #[derive(Debug, Clone, Copy)]
 pub struct Survivors<'a> {
     /// Attributes of all Gaussians at the reference frame. Of the SH coefficients, comparisons use only those of degree
-    /// 0; proxies get those of all degrees.
+    /// 0; proxies (Gaussians that replace merged groups) get those of all degrees.
     pub states: &'a Gaussians,
     /// Rows of the survivors (Gaussians left by pruning) in `states`, increasing.
     pub rows: &'a [u32],
-    /// Ids of the Gaussians in `states`, and the contribution C and the visibility of each id. Leaders are ranked by C;
-    /// ties are broken by the hashes of the ids.
+    /// Ids of the Gaussians in `states`, and the contribution C and the visibility of each id. The leader of a group,
+    /// into which the others are merged, is chosen by C; ties are broken by the hashes of the ids.
     pub importance: Importance<'a>,
     /// Merge class of every row of `states`. A Gaussian merges only with others of its class. A Gaussian of class
     /// `None`, or with a value that is not finite, never merges.
@@ -86,7 +87,8 @@ pub struct RequestedPairs<'a> {
     row: &'a [u32],
     /// Maximum distance ε of the two nodes of a pair at the reference frame, in scene units.
     pub max_distance: f64,
-    /// Whether further pairs of the same pass are requested in other calls.
+    /// Whether these are only some of the pairs to be measured: all pairs were too many for one call of the callback
+    /// that measures motion, so they are divided among several calls.
     pub is_part: bool,
 }
 
@@ -98,7 +100,7 @@ impl<'a> RequestedPairs<'a> {
     }
 }
 
-/// Result of merging: groups of Gaussians, and a proxy for each group that has more than one.
+/// Result of merging: groups of Gaussians, and, for each group of more than one, the proxy (Gaussian) that replaces it.
 #[derive(Debug, Clone)]
 pub struct MergeResult {
     /// Groups of the survivors (Gaussians left by pruning). Every survivor is in exactly one group.
@@ -124,8 +126,8 @@ pub struct PassCounts {
     /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
     /// they join). Nodes without a leader after the last round are assigned sequentially and not counted here.
     pub rounds: usize,
-    /// Whether some nodes (Gaussians or merged groups) had no leader after the last parallel round and were assigned
-    /// sequentially.
+    /// Whether some nodes (Gaussians or merged groups) were assigned to leaders (the nodes that they join)
+    /// sequentially, after the last parallel round.
     pub sequential: bool,
 }
 
@@ -216,8 +218,9 @@ pub fn run<E>(
     Ok(MergeResult { groups, proxies, passes })
 }
 
-/// Returns the rank of each of `groups`. Groups are ranked by the sum of the contributions C of their Gaussians,
-/// largest first; ties are broken by the hash of the leader's id.
+/// Returns the rank of each of `groups`, from 0. Groups are ranked by the sum of the contributions C of their
+/// Gaussians, largest first; ties are broken by the hash of the id of the leader, the Gaussian into which the others
+/// are merged.
 fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
     let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
@@ -226,12 +229,14 @@ fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     greedy::ranks(&sizes, &hashes)
 }
 
-/// Nodes of one merging pass: single Gaussians, and the proxies of groups merged in earlier passes.
+/// Nodes of one merging pass: single Gaussians, and groups merged in earlier passes, each with its proxy (merged
+/// Gaussian).
 struct MergeNodes<'a> {
     survivors: &'a Survivors<'a>,
     groups: &'a MergeGroups,
     proxies: &'a Gaussians,
-    /// Row of each node: in the survivors' states for a single Gaussian, in `proxies` for a merged group.
+    /// Row of each node in its table of states: in `survivors.states` for a single Gaussian, in `proxies` for a merged
+    /// group.
     place: Vec<u32>,
 }
 
@@ -285,10 +290,12 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Finds sets of coincident nodes: nodes that are equal in every attribute that tests 1 and 2 ([`appearance`]) compare,
-/// and that pass these tests. Calls `take` with the pairs (leader, member) of each set. The leader is the node of the
-/// set that ranks first; all others are its members, however many there are. Pairs are ordered by leader, and each call
-/// of `take` gets at most `max_batch` pairs (at least 1).
+/// Finds sets of coincident nodes (Gaussians or merged groups): nodes that are equal in every attribute that tests 1
+/// and 2 ([`appearance`]) compare, and that pass these tests with the thresholds `gates`. The leader of a set is the
+/// node that ranks first; all others are its members, however many there are.
+///
+/// Calls `take` with the pairs (leader, member), ordered by leader. Each call gets at most `max_batch` pairs (at least
+/// 1), and whether the pairs are divided among several calls.
 ///
 /// This step is needed because the neighbor search returns only a fixed number of nearest Gaussians. If more Gaussians
 /// than that coincide, each of them finds only neighbors that coincide with it. Without this step, they would not all
@@ -323,11 +330,13 @@ fn each_coincident<E>(
     pairs.chunks(max_batch).try_for_each(|some| take(some, is_part))
 }
 
-/// Finds the pairs of nodes (leader, member) that pass tests 1 (place and size) and 2 (color) of `pass`, and calls
-/// `take` with them. The member is among the leader's nearest neighbors and ranks after it. `unit`: number of scene
-/// units in one unit of the recipe's lengths. Pairs are ordered by leader in voxel order, then by distance. Each call
-/// of `take` gets at most `max_batch` pairs (at least 1), and whether the pairs are divided among several calls.
-/// Returns the number of nodes with more neighbors within the radius ε than were examined.
+/// Finds the pairs of nodes (Gaussians or merged groups) that pass tests 1 (place and size) and 2 (color) of `pass`. A
+/// pair (leader, member) proposes to merge the member into the leader. The member is among the leader's nearest
+/// neighbors and ranks after it. `unit`: number of scene units in one unit of the recipe's lengths. Returns the number
+/// of nodes with more neighbors within the radius ε than were examined.
+///
+/// Calls `take` with the pairs, ordered by leader in voxel order, then by distance. Each call gets at most `max_batch`
+/// pairs (at least 1), and whether the pairs are divided among several calls.
 ///
 /// A node that may not merge, or has a value that is not finite, is in no pair and does not count as a neighbor.
 ///

@@ -127,8 +127,8 @@ fn unit_from_axes(frame: &DMat3) -> DQuat {
 /// rotations that map axes to axes, the one with the largest |⟨q, reference⟩| is taken, the first one on a tie. The
 /// quaternion q gets the sign nearest to `reference`.
 ///
-/// A deformation field adds its deltas axis by axis, so the axes of a proxy must be in the same order as those of its
-/// leader.
+/// A deformation field adds its deltas axis by axis. So the axes of a merged Gaussian must be in the same order as
+/// those of the Gaussian whose deltas it gets.
 pub fn align_axes(ellipsoid: &Ellipsoid, reference: DQuat) -> Ellipsoid {
     let axes = DMat3::from_quat(ellipsoid.rotation);
     let (mut closest, mut rotation, mut scales) = (f64::NEG_INFINITY, ellipsoid.rotation, ellipsoid.scales);

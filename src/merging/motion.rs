@@ -23,10 +23,10 @@ pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
     /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the steps of the two Gaussians from the previous
-    /// frame to this frame. The mean is over the frames in which both Gaussians are alive (opacity ≥ alpha_min). With
-    /// `MotionParams::Runs`, a frame counts only if both are also alive in the previous frame. With
-    /// `MotionParams::Literal`, all these frames count, and the first frame of the sequence, which has no step, counts
-    /// as 0. The cosine is also 0 if a or b is zero.
+    /// frame to this frame. The cosine is 0 if a or b is zero. The mean is over frames in which both Gaussians are
+    /// alive (opacity ≥ alpha_min):
+    /// - with `MotionParams::Runs`, only those in whose previous frame both are alive, too;
+    /// - with `MotionParams::Literal`, all of them; the first frame of the sequence, which has no step, counts as 0.
     pub cosine: f64,
     /// Σ a·b over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
     pub dot: f64,
@@ -38,8 +38,9 @@ pub struct PairMeasure {
     pub common: u32,
     /// Number of frames in which at least one of the Gaussians is alive (opacity ≥ alpha_min).
     pub union: u32,
-    /// Maximum change of the offset x_i − x_j from its value at the reference frame, in scene units, over the frames in
-    /// which both are alive (opacity ≥ alpha_min). Proxies are built from the offset at the reference frame.
+    /// Largest measured change of the offset between the two Gaussians (difference of their positions) from its value
+    /// at the reference frame. In scene units, over the frames in which both Gaussians are alive (opacity ≥ alpha_min).
+    /// A proxy (Gaussian that replaces both) is built from the offset at the reference frame.
     pub drift: f64,
 }
 
@@ -88,9 +89,10 @@ impl MotionThresholds {
     }
 
     /// Returns the motion similarity of a pair, in [−1, 1]. The pair passes test 3 if the similarity exceeds the
-    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two Gaussians are never alive (opacity ≥
-    /// alpha_min) together, if the fraction of frames with only one alive is too large, or if the two Gaussians drift
-    /// too far apart.
+    /// minimum τ_m of the pass. Returns NaN, with which a pair never passes, in three cases:
+    /// - the two Gaussians are never alive (opacity ≥ alpha_min) together;
+    /// - the fraction of frames with only one alive exceeds its maximum;
+    /// - the change of their offset over time ([`PairMeasure::drift`]) exceeds its maximum.
     pub fn similarity(&self, pair: &PairMeasure) -> f64 {
         let together =
             pair.common > 0 && pair.drift <= self.max_drift && pair.fraction_with_one_alive() <= self.max_dead_time;
@@ -135,10 +137,12 @@ pub struct PairMotion {
 }
 
 impl PairMotion {
-    /// Starts the measurement of `pairs`, each given as the indices of two nodes. `reference` yields the position of
-    /// every node at the reference frame. `motion` selects the steps that count: for `Literal`, all steps that end in a
-    /// frame in which both nodes are alive (opacity ≥ alpha_min); for `Runs`, only those that also begin in such a
-    /// frame.
+    /// Starts to measure how alike the two nodes (Gaussians or merged groups) of each pair move: the [`PairMeasure`] of
+    /// the pair. `pairs` yields the indices of the two nodes of each pair. `reference` yields the position of every
+    /// node at the reference frame. Frames are added with [`PairMotion::add_frame`]. `motion` selects the steps (from
+    /// one frame to the next) that count:
+    /// - `Literal`: all steps that end in a frame in which both nodes are alive (opacity ≥ alpha_min);
+    /// - `Runs`: only steps that begin and end in such a frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -246,7 +250,8 @@ mod tests {
 
     type Path = Vec<(f32, bool)>;
 
-    /// Measures a pair of nodes that move along x on the paths `a` and `b`; the reference frame is frame 0.
+    /// Measures a pair of nodes that move along the x axis. `a` and `b` hold the x coordinate of each node at every
+    /// frame, and whether it is alive. The reference frame is frame 0.
     fn measure(a: &Path, b: &Path, motion: MotionParams) -> PairMeasure {
         let state = |t: usize, node: usize| {
             let (x, alive) = [a, b][node][t];

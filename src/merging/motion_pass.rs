@@ -29,8 +29,9 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
 
 /// Returns the bytes of memory for each Gaussian in the pairs that are measured together (at most two Gaussians per
-/// pair): its index and id, its track, its state at one frame, and its states at the `frames_held` frames that a reader
-/// holds. The memory of the source's own reader is not included.
+/// pair). They hold its index and id, its record in the measurement ([`NODE_BYTES`]), its position and opacity at one
+/// frame, and those at the `frames_held` frames that a reader keeps. The memory of the source's own reader is not
+/// included.
 pub fn bytes_per_gaussian(frames_held: usize) -> usize {
     8 + NODE_BYTES + 16 * (1 + frames_held.min(FRAME_BLOCK))
 }
@@ -71,11 +72,14 @@ impl PairMeter<'_> {
         PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
     }
 
-    /// Measures the motion similarity of each of `pairs` and returns it with its pair, in any order. Pairs are given as
-    /// rows of `ids`, a list of increasing ids. `reference` `[3, M]` holds the positions of these M Gaussians at the
-    /// reference frame. The two Gaussians of a pair are at most about `reach` apart at that frame. `ids` and
-    /// `reference` must be the same in every call. `is_part` is true if pairs are also requested in other calls, so
-    /// that gathering the trajectories in a file saves time.
+    /// Measures the motion similarity of each of `pairs` and returns it with its pair, in any order.
+    /// - `ids`: increasing ids of M Gaussians; a pair is given as two rows of this list;
+    /// - `reference`: positions of these M Gaussians at the reference frame, `[3, M]`;
+    /// - `reach`: approximate maximum distance of the two Gaussians of a pair at that frame;
+    /// - `is_part`: whether pairs are also requested in other calls, so that gathering the trajectories in a file saves
+    ///   time.
+    ///
+    /// `ids` and `reference` must be the same in every call.
     ///
     /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, and [`bytes_per_gaussian`] for every Gaussian in a pair.
     /// If trajectories are gathered, also 8 bytes for each of `ids`; while they are being gathered, 12 more and the

@@ -14,9 +14,11 @@ use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::model::{self, Attributes, Gaussians};
 use crate::recipe::{self, ProxyHigherSh, ProxyOpacity, ProxyPosition};
 
-/// Number of proxies that are computed before their values are written to the output.
+/// Number of proxies (Gaussians that replace merged clusters) that are computed before their values are written to the
+/// output.
 const BATCH: usize = 4096;
-/// Minimum distance of a proxy's opacity from 0 and from 1, so that its logit is finite in f32.
+/// Minimum distance of the opacity of a proxy (Gaussian that replaces a merged cluster) from 0 and from 1, so that its
+/// logit is finite in f32.
 const OPACITY_MARGIN: f64 = 1.0 / (1u32 << 24) as f64;
 /// Exponent p of Thomsen's approximation of the surface of an ellipsoid (Knud Thomsen, 2004; see Michon, "Surface area
 /// of an ellipsoid").
@@ -58,7 +60,7 @@ impl ProxyState {
     }
 }
 
-/// Importance of Gaussians, which determines the weights of the members of a cluster.
+/// Importance of Gaussians, which determines their weights when they are merged.
 #[derive(Debug, Clone, Copy)]
 pub struct Importance<'a> {
     /// Id of the Gaussian in each row of the table of Gaussians.
@@ -81,9 +83,12 @@ impl Importance<'_> {
     }
 }
 
-/// Returns the weights of the `members` of a cluster, which are rows of `states`. Weights are proportional to
-/// contribution × visibility (C·Vis, from `importance`) and sum to 1. If the sum of the products C·Vis is not positive
-/// and finite, weights are proportional to opacity × area; if that fails too, all are equal.
+/// Returns the weights of the `members` of a cluster, which are rows of `states`. The weights sum to 1. They are
+/// proportional to the first of these quantities that is never negative and has a positive, finite sum over the
+/// members:
+/// - contribution × visibility (C·Vis, from `importance`);
+/// - opacity × projected area of the Gaussian, averaged over all directions;
+/// - 1, so that all weights are equal.
 pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians) -> Vec<f64> {
     let weighted_contribution = |&i: &u32| importance.weighted_contribution(i);
     let opaque_area = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
@@ -149,8 +154,9 @@ pub fn merge_state(
     }
 }
 
-/// Computes the proxy of every group in `groups` that has more than one Gaussian, from the Gaussians `states` and their
-/// `importance`, by the parameters `merge`. The result has one row for each such group, in the order of the groups.
+/// Computes the proxy (Gaussian that replaces several) of every group in `groups` that has more than one Gaussian, from
+/// the Gaussians `states` and their `importance`, by the parameters `merge`. The result has one row for each such
+/// group, in the order of the groups.
 pub fn merge_groups(
     groups: &MergeGroups,
     importance: &Importance<'_>,
@@ -215,8 +221,8 @@ fn mean_area(scales: DVec3) -> f64 {
     std::f64::consts::PI * mean.powf(1.0 / THOMSEN) * largest * largest
 }
 
-/// Returns the opacity of the proxy of `members` (rows of `states` with weights) by the rule `rule`, clamped so that
-/// its logit is finite.
+/// Returns the opacity of `proxy`, the Gaussian that replaces `members` (rows of `states` with weights), by the rule
+/// `rule`, clamped so that its logit is finite.
 fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid, rule: ProxyOpacity) -> f64 {
     let sum = || members.iter().map(|&(i, _)| opacity(states, i)).sum::<f64>();
     let opacity = match rule {

@@ -15,7 +15,7 @@ pub type PairSimilarity = (u32, u32, f64);
 pub struct SimilarityCache(Vec<PairSimilarity>);
 
 impl SimilarityCache {
-    /// Returns the pairs in `pairs` whose similarity is not known yet, sorted and without duplicates. Each returned
+    /// Returns the pairs in `pairs` whose similarity is not in the cache, sorted and without duplicates. Each returned
     /// pair has its smaller row first.
     pub fn missing(&self, pairs: impl ExactSizeIterator<Item = (u32, u32)>) -> Vec<(u32, u32)> {
         let mut missing = Vec::with_capacity(pairs.len());
@@ -43,7 +43,7 @@ impl SimilarityCache {
         }
     }
 
-    /// Returns the motion similarity of the pair (`a`, `b`), in either order; `None` if it is not known.
+    /// Returns the motion similarity of the pair (`a`, `b`), in either order; `None` if the pair is not in the cache.
     pub fn similarity(&self, (a, b): (u32, u32)) -> Option<f64> {
         self.position((a.min(b), a.max(b))).ok().map(|position| self.0[position].2)
     }

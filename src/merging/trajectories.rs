@@ -118,8 +118,8 @@ impl Trajectories {
         Ok(())
     }
 
-    /// Reads the rows `places` of a table into `out`. The table begins `first` numbers after the start of the file and
-    /// has `width` numbers per row.
+    /// Reads the rows with the indices `places` (increasing) of a table in the file into `out`. A row holds `width`
+    /// numbers (f32) of one Gaussian. The table begins `first` numbers after the start of the file.
     fn read(&self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
         let mut values: Vec<f32> = Vec::new();
         for run in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {

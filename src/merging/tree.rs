@@ -107,8 +107,9 @@ impl Tree {
         Tree { nodes, depth }
     }
 
-    /// Adds to `nearest` the points in `points` that are among the nearest, and skips subtrees that are too far away.
-    /// `points` must be in the order that [`Tree::new`] gave them.
+    /// Searches the tree for the points nearest to the position in `nearest`, and adds them to `nearest`. Skips
+    /// subtrees that hold no point nearer than the worst one found so far. `points`: all points of the tree, in the
+    /// order that [`Tree::new`] gave them.
     pub fn search(&self, points: &[TreePoint], nearest: &mut NearestPoints) {
         self.visit(0, self.depth, points, self.nodes[0].nearest_possible(nearest.at), nearest);
     }

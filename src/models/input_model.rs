@@ -213,8 +213,8 @@ pub trait InputModel: Send + Sync {
         false
     }
 
-    /// Returns whether an archive of this input is a lossy container of its frames (`.gseq` with bounded errors), not a
-    /// `.gsz`.
+    /// Returns whether an archive of this input is a container of its frames (`.gseq`) with a bounded error per value,
+    /// instead of a `.gsz`.
     fn archives_as_frames(&self) -> bool {
         self.has_explicit_frames()
     }
@@ -249,7 +249,7 @@ pub trait InputModel: Send + Sync {
 pub enum TimeOrigin {
     /// The model is continuous in time: a frame can be at any time.
     Continuous,
-    /// The number of frames is fixed; their times may come from cameras.
+    /// The number of frames is fixed. The input stores no times for them; the times may come from cameras.
     Numbered,
     /// The times of the frames are stored in the input.
     Stamped,
@@ -418,8 +418,8 @@ pub struct TrainingConventions {
     /// Whether the rotations of 4D Gaussian Splatting use the convention from before 15 September 2024: the order of
     /// the axes of the 4D rotation matrix is not reversed.
     pub rot4d_unflipped: bool,
-    /// How Gaussians of a `.splatv` or `.ftgs.ply` with a zero quaternion are treated; `None` means
-    /// [`ZeroRotation::Drop`].
+    /// How Gaussians of a `.splatv` or `.ftgs.ply` with a zero quaternion are treated. `None` leaves them out, as
+    /// [`ZeroRotation::Drop`] does.
     pub zero_rotation: Option<ZeroRotation>,
 }
 
@@ -427,16 +427,19 @@ pub struct TrainingConventions {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LinkMode {
-    /// Links the frames of a folder only if their numbers of Gaussians differ or the order of Gaussians does not
-    /// identify them.
+    /// Links frames (finds which Gaussian of a frame is which Gaussian of the next frame) only if needed. The frames of
+    /// a folder are linked if they have different numbers of Gaussians, or if the same index means different Gaussians
+    /// in different frames. A stream is linked if its header says that its frames share no Gaussian ids.
     #[default]
     Auto,
-    /// Always links, even frames with Gaussians in a common order, containers and streams.
+    /// Always links frames (matches their Gaussians): also those of containers and streams, and frames in which each
+    /// index already means the same Gaussian.
     Always,
-    /// Always links, but neither joins tracks (Gaussians followed through frames) that seem to be one Gaussian nor
-    /// makes nearly constant attributes constant.
+    /// Always links frames (matches their Gaussians), as [`LinkMode::Always`], but leaves the result unchanged: does
+    /// not join tracks (Gaussians followed through frames) that seem to be one Gaussian, and does not make nearly
+    /// constant attributes constant.
     Apart,
-    /// Never links: the same index means the same Gaussian in every frame.
+    /// Never links frames (matches their Gaussians): the same index is taken to mean the same Gaussian in every frame.
     Never,
 }
 

@@ -76,9 +76,10 @@ const MAX_MEASURED_PAIRS: usize = 5;
 
 /// Whether the same index means the same Gaussian in every frame.
 enum FrameOrder {
-    /// Assumed without measurement: the same index means the same Gaussian.
+    /// The same index is assumed to mean the same Gaussian in every frame. Frames were not compared.
     Assumed,
-    /// Measured: the same index means the same Gaussian. The note for the user gives the measured differences.
+    /// A comparison of frames showed that the same index means the same Gaussian. Holds a note for the user with the
+    /// measured differences.
     Confirmed(String),
     /// The same index does not mean the same Gaussian in every frame. Holds the reason, for messages.
     Lost(String),

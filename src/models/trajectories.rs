@@ -1,6 +1,6 @@
 //! Functions shared by formats of explicit trajectories, where the state of each Gaussian is stored for every frame. A
-//! proxy (Gaussian that replaces merged ones) is computed from its members in each frame (moment match), so it needs no
-//! parameters of its own.
+//! proxy (Gaussian that replaces merged ones) is computed from the merged Gaussians in each frame (mean and covariance
+//! of their mixture), so it needs no parameters of its own.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

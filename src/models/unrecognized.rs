@@ -102,7 +102,8 @@ fn layouts() -> String {
     format!("inputs that can be read:\n    {}", lines.join("\n    "))
 }
 
-/// Returns whether `folder` contains `file`, which is a pattern of [`FolderLayout::files`].
+/// Returns whether `folder` contains a file or folder that matches the pattern `file`, an entry of
+/// [`FolderLayout::files`].
 fn has(folder: &Path, file: &str) -> bool {
     let Some((head, rest)) = file.split_once('/') else {
         return match file {

@@ -1,9 +1,9 @@
-//! Writes any sequence to a `.gseq` container, one frame block (consecutive frames) after the other. A tile has the
-//! values of one attribute of one block of Gaussians in one frame block. Attributes are the columns of the container.
+//! Writes any sequence to a `.gseq` container, one frame block (consecutive frames) after the other. A container has
+//! one column per attribute. A tile has the values of one column for one block of Gaussians in one frame block.
 //!
 //! Memory per thread: one tile of every column, with [`GAUSSIAN_BLOCK`] × frames × components values, and the same
-//! amount again while it is encoded (four times the tile for a column with an error bound). Also 80 bytes per column
-//! and block of Gaussians, and 16 per frame.
+//! amount again while the tiles are encoded (four times the tile for a column with an error bound). In addition, the
+//! index takes 80 bytes per column and block of Gaussians, and 16 bytes per frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -18,8 +18,8 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::source::{FrameSource, Ids};
 
-/// Number of Gaussians per tile (values of one attribute that are encoded together). One task of a scan reads such a
-/// block of Gaussians. The number is constant, so that the bytes of a container depend only on its values.
+/// Number of Gaussians per tile (values of one attribute that are encoded together), and per task when threads share a
+/// pass over all frames. The number is constant, so that the bytes of a container depend only on its values.
 pub const GAUSSIAN_BLOCK: usize = 1024;
 /// Number of frames per tile (values that are encoded together) in a container without error bounds. Streams with large
 /// frames are stored with fewer frames per tile.
@@ -105,9 +105,9 @@ pub fn write_container(
 }
 
 /// Encodes the frame blocks with the numbers `blocks` of `source` in the encoding `packing`, and writes them to the
-/// scratch file `to`, from which [`join_container`] reads them. Writes one record per tile, in order. An empty record
-/// means that the tile equals that of the frame block before. Calls `advance` with the number of Gaussian states
-/// (Gaussians × frames) encoded since the last call.
+/// scratch file `to`, from which [`join_container`] reads them. The file gets one record (byte string with its length)
+/// per tile, in order. An empty record means that the tile equals that of the frame block before. Calls `advance` with
+/// the number of Gaussian states (Gaussians × frames) encoded since the last call.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or written.
@@ -128,9 +128,9 @@ pub fn spill_blocks(
 }
 
 /// Writes the container `path` from the frame blocks of `source` that [`spill_blocks`] encoded with the same `packing`,
-/// and with the metadata `attributes` (names and texts). The result has the same bytes as the
-/// file that [`write_container`] writes. `spills` lists the scratch files, each with the numbers of its frame blocks;
-/// together they must have all frame blocks, in order. Memory: a tile, and the index of the container.
+/// and with the metadata `attributes` (names and texts). The file has the same bytes as one that [`write_container`]
+/// writes. `spills` lists the scratch files, each with the numbers of its frame blocks; together they must have all
+/// frame blocks, in order. Memory: a tile, and the index of the container.
 ///
 /// # Errors
 /// Fails if a scratch file cannot be read back or the container cannot be written.
@@ -248,9 +248,10 @@ impl ContainerWriter {
     }
 
     /// Adds the frames `frames` of `source` as the next frame block (consecutive frames), with the time stamps `times`.
-    /// `presence` states for each block of Gaussians how it changes in these frames, which saves reading and encoding.
-    /// If all frames of a block of Gaussians are equal, only the first frame is read and encoded. If they also repeat
-    /// the frame block before, nothing is read or encoded.
+    /// `presence[k]` states how block number k of the Gaussians changes in these frames. This saves reading and
+    /// encoding:
+    /// - If the Gaussians are equal in all these frames, only the first frame is read and encoded.
+    /// - If they also equal those of the frame block before, nothing is read or encoded.
     pub fn append_with_presence(
         &mut self,
         source: &dyn FrameSource,
@@ -289,25 +290,26 @@ impl ContainerWriter {
     }
 }
 
-/// Change of a block of Gaussians over the frames of one frame block (consecutive frames). It decides which tiles are
-/// encoded.
+/// Change of a block of Gaussians over the frames of one frame block (consecutive frames). It decides which values of
+/// these Gaussians are encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockChange {
-    /// Block that changes from frame to frame. Attributes that vary with time in the source are encoded for every
-    /// frame; the others equal those of the frame block before and are not encoded again.
+    /// Gaussians that change from frame to frame. Attributes that vary with time in the source are encoded for every
+    /// frame. The other attributes equal those of the frame block before and are not encoded again.
     Varying,
-    /// Block that may differ from the frame block before in every attribute. Attributes that vary with time in the
-    /// source are encoded for every frame, the others for the first frame.
+    /// Gaussians of which every attribute may differ from the frame block before. Attributes that vary with time in the
+    /// source are encoded for every frame, the other attributes for the first frame only.
     New,
-    /// Block that is equal in all frames, so that only the first frame is encoded.
+    /// Gaussians that are equal in all frames of the frame block, so that only its first frame is encoded.
     Still,
-    /// Block that is equal in all frames, and equal to the frame block before. No tile is encoded.
+    /// Gaussians that are equal in all frames of the frame block, and equal to the frame block before. Nothing is
+    /// encoded.
     Repeating,
 }
 
-/// Returns one [`BlockChange`] per block of Gaussians of `source`, for a frame block in which no block is known to be
-/// constant: [`BlockChange::New`] for all blocks if it is the first frame block (`is_first`), otherwise
-/// [`BlockChange::Varying`].
+/// Returns the [`BlockChange`] of every block of Gaussians of `source` for one frame block (consecutive frames), if
+/// nothing is known about how the Gaussians change. All blocks have the same value: [`BlockChange::New`] in the first
+/// frame block (`is_first`), [`BlockChange::Varying`] in all later ones.
 fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange> {
     // An attribute that never varies is encoded for the first frame block only.
     let presence = if is_first { BlockChange::New } else { BlockChange::Varying };
@@ -321,10 +323,10 @@ pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
 }
 
 /// Encodes the frames `frames` of `source` as one frame block (consecutive frames that are stored together). `presence`
-/// tells for each block of Gaussians which of its values have to be encoded. Calls `each` for every tile in the order
-/// of the container, with the index of its block of Gaussians, the index of its column, and the tile; `None` means that
-/// the tile equals that of the frame block before. Calls `advance` with the number of Gaussian states (Gaussians ×
-/// frames) encoded since the last call.
+/// tells for each block of Gaussians which of its values have to be encoded.
+/// - Calls `each` for every tile in the order of the container, with the index of its block of Gaussians, the index of
+///   its column, and the tile. `None` in place of the tile means that the tile equals that of the frame block before.
+/// - Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last call.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
@@ -363,7 +365,7 @@ fn encode_frames(
 }
 
 /// Encodes the blocks of Gaussians with the numbers `blocks` of `source`, with the frames `frames` as one frame block.
-/// Returns the number of bytes that each column (attribute) takes.
+/// Returns the number of encoded bytes of each column (attribute), summed over these blocks. Writes no file.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.

@@ -68,9 +68,9 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
 
 /// Rounds positions, velocities, colors and opacities in `set` to the quantization grid of the file, so that the
 /// encoder accepts them. The encoder checks that each decoded value differs from the given one by at most half a
-/// quantization step, without a margin for the rounding of decoded values to f32. A value midway between two grid
-/// points could fail this check. Coordinates of a few scene units may lie midway between two grid points, and odd 8-bit
-/// colors always do.
+/// quantization step. This check fails for some values midway between two grid points, because decoded values are
+/// rounded to f32. Coordinates of a few scene units may lie midway between two grid points, and odd 8-bit colors always
+/// do.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {

@@ -1,4 +1,5 @@
-//! Kinds of output, and which kind a file name stands for.
+//! Kinds of output ([`OutputKind`]: file formats and folder layouts), and the kind that the ending of a file name
+//! stands for.
 
 use std::path::Path;
 
@@ -46,8 +47,10 @@ pub enum OutputKind {
 }
 
 impl OutputKind {
-    /// Returns the kind of output. This is `asked` if the user named a kind, else the kind that the ending of `path`
-    /// stands for, else the kind of the input, `input_kind`.
+    /// Returns the kind of output, from the first of these sources that gives one:
+    /// - `asked`: the kind that the user named.
+    /// - The ending of `path`.
+    /// - `input_kind`: the kind of the input.
     pub fn from_path(path: &Path, asked: Option<OutputKind>, input_kind: OutputKind) -> OutputKind {
         asked.or(Self::from_name(path)).unwrap_or(input_kind)
     }
@@ -171,9 +174,10 @@ pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// Returns the ending of `path` if it looks like the ending of a file: letters only, or one of a few endings with
-/// digits. Otherwise returns `None`: `small.v2` and `run.2024` count as names of folders. Also returns `None` for an
-/// existing folder, which may have any name.
+/// Returns the ending of the file name `path` if it looks like the ending of a file: letters only, or one of a few
+/// endings with digits, such as `mp4`. Returns `None` in two cases:
+/// - The ending has other digits. `small.v2` and `run.2024` count as names of folders.
+/// - `path` is an existing folder, which may have any name.
 fn foreign_ending(path: &Path) -> Option<&str> {
     const WITH_DIGITS: [&str; 7] = ["mp4", "4dgs", "splat4d", "h5", "hdf5", "7z", "bz2"];
     let ending = path.extension()?.to_str()?;

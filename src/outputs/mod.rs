@@ -20,9 +20,9 @@ pub mod time_windows;
 mod tests {
     use crate::model::{Gaussians, opacity};
 
-    /// Returns the opacity of Gaussian `id` of the frame state `state`, and the opacities that a player shows near it.
-    /// `shown` has the position and opacity of everything that the player shows at this frame. Near means closer to the
-    /// Gaussian than half its largest scale. Returns `None` if the opacity of the Gaussian is below 0.1.
+    /// Returns two results: the opacity of Gaussian `id` of the frame state `state`, and the opacities of everything
+    /// that a player shows closer to this Gaussian than half its largest scale. `shown` has the position and opacity of
+    /// everything that the player shows at this frame. Returns `None` if the opacity of the Gaussian is below 0.1.
     pub(super) fn opacities_near(state: &Gaussians, id: usize, shown: &[([f64; 3], f64)]) -> Option<(f64, Vec<f64>)> {
         let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
         let at = state.position.row::<3>(id).map(f64::from);

@@ -1,4 +1,4 @@
-//! Tables of the statistics, scores and decisions of all Gaussians, for people and notebooks.
+//! Tables with the statistics, the scores and the decision (kept or not) of every Gaussian, for people and notebooks.
 //!
 //! Input: [`RowTable`]. Output: `.npz` (one array per column) or `.csv` (one line per Gaussian), with the same columns
 //! and, to the bit, the same values. Memory: none that grows with the number of Gaussians. The bytes depend only on the

@@ -75,8 +75,8 @@ pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Res
 }
 
 /// Writes all frames of `source` to the file `path` in the format `kind`, as fitted Gaussians with linear motion and an
-/// opacity that is a Gaussian function of time. A `.tsog` is written as single frames instead if these are better.
-/// Returns notes for the user: the errors of the fit, and what was written instead.
+/// opacity that is a Gaussian function of time. Writes a `.tsog` as single frames instead if the fit is too inaccurate
+/// or takes more bytes. Returns notes for the user: the errors of the fit, and what was written instead.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -123,10 +123,12 @@ pub fn write_fitted_windows(
 }
 
 /// Returns whether single frames are written instead of `lines`, which are fitted Gaussians with linear motion.
-/// `misfit` is the error of the fit. Single frames are written in two cases: if `lines` are far off in more than the
-/// fraction [`MAX_FAR_SHARE`] of the visible states (one Gaussian at one frame), or if single frames, which have no fit
-/// error, take no more bytes by an estimate. They are never written if they have more than
-/// [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians or [`MAX_FRAMES`] frames.
+/// `misfit` is the error of the fit. One of two reasons must hold:
+/// - `lines` are far off in more than the fraction [`MAX_FAR_SHARE`] of the visible states (one Gaussian at one frame).
+/// - Single frames, which have no fit error, take no more bytes by an estimate.
+///
+/// Single frames are never written if they have more than [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians or [`MAX_FRAMES`]
+/// frames.
 fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     let is_far_off = misfit.far_off_fraction() > MAX_FAR_SHARE;
     let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
@@ -191,8 +193,9 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
     Ok(FittedWindows { lines: TimedGaussians { params, timeline: Timeline::Windows, clip }, misfit, left_out })
 }
 
-/// Returns whether all values of the fitted linear motion `line` are finite as f32. The width of its time window is not
-/// checked, because it may be infinite.
+/// Returns whether all values of the fitted Gaussian `line` are finite as f32. Its motion is linear: of the
+/// coefficients in [`CubicTrack`], the quadratic and cubic ones are 0. The width of its time window is not checked,
+/// because it may be infinite.
 fn is_finite(line: &CubicTrack) -> bool {
     let values = line.position.iter().flatten().chain(&line.rotation[0]).chain(&line.log_scale).copied();
     let values = values.chain([line.opacity, line.center]);
@@ -200,7 +203,9 @@ fn is_finite(line: &CubicTrack) -> bool {
     values.chain(sh).all(|value| (value as f32).is_finite())
 }
 
-/// Sets the parameters of the Gaussian `row` of `params` to those of the fitted linear motion `line`.
+/// Sets the parameters of the Gaussian with index `row` in `params` to those of the fitted Gaussian `line`. The motion
+/// of `line` must be linear: of the coefficients in [`CubicTrack`], the quadratic and cubic ones and the linear one of
+/// the rotation are 0.
 fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
     let narrow = |value: f64| value as f32;
     let gaussians = &mut params.gaussians;

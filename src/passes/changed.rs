@@ -1,5 +1,5 @@
-//! Frame source that adds parameter deltas (changes made by refinement) to the Gaussians of another source, or omits
-//! their higher SH degrees, as each frame is read.
+//! Frame source that reads frames from another source and changes them: adds parameter deltas (changes made by
+//! refinement) to the Gaussians, and leaves out SH coefficients above a given degree.
 
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::Result;
@@ -16,9 +16,9 @@ pub struct SourceWithDeltas<'a> {
 }
 
 impl<'a> SourceWithDeltas<'a> {
-    /// Creates a source of the frames of `source` with these changes: adds `delta` and `trajectory` to its Gaussians,
-    /// and keeps the SH coefficients up to `sh_degree` only. If both deltas are empty and `source` has no higher SH
-    /// degree, its frames are returned unchanged.
+    /// Creates a source that returns the frames of `source` with two changes: `delta` and `trajectory` are added to the
+    /// Gaussians, and SH coefficients above `sh_degree` are left out. If both deltas are empty and there are no such
+    /// coefficients, the frames are returned unchanged.
     pub fn new(
         source: Box<dyn FrameSource + 'a>,
         delta: &'a ParamDelta,
@@ -44,7 +44,8 @@ impl<'a> SourceWithDeltas<'a> {
         ChangedReader { reader, delta, trajectory, frames: self.info.times.len(), all_sh: self.dropped_sh_buffer() }
     }
 
-    /// Returns a buffer for all SH coefficients of `source` if its SH degree is lowered; otherwise `None`.
+    /// Returns an empty buffer into which all SH coefficients of `source` can be read before those of higher degrees
+    /// are dropped; `None` if none are dropped.
     fn dropped_sh_buffer(&self) -> Option<AttributeValues> {
         let degree = self.source.info().sh_degree;
         (degree > self.info.sh_degree).then(|| Gaussians::zeros(0, degree).sh)

@@ -8,7 +8,8 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Readers of many Gaussians, one per block of Gaussians, which stay open for all frames to be read.
+/// Readers of many Gaussians of a frame source: one reader for each block of [`GAUSSIANS_PER_BLOCK`] Gaussians. All
+/// readers stay open while one frame after the other is read.
 ///
 /// Memory: one reader for every block; on each thread the attributes of one block at one frame.
 pub struct FrameReaders<'a> {

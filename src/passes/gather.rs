@@ -46,8 +46,9 @@ pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Attributes) -> R
     Ok(all)
 }
 
-/// Reader of all Gaussians of a source in which every frame is decoded on its own. It opens a new reader for each block
-/// of Gaussians at each frame, because readers of such a source that stay open would take memory and save no work.
+/// Reader of all Gaussians, for a source that decodes every frame independently of the others. It opens a new reader
+/// for each block of Gaussians at each frame, because readers of such a source that stay open would take memory and
+/// save no work.
 pub struct BlockwiseReader<'a> {
     source: &'a dyn FrameSource,
     ids: Vec<u32>,

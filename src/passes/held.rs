@@ -71,7 +71,7 @@ impl FrameSource for FramesInMemory {
 struct HeldReader<'a> {
     held: &'a FramesInMemory,
     len: usize,
-    /// Ranges of consecutive ids. Joined in this order, they are the ids of the Gaussians to read.
+    /// Ids of the Gaussians to read, in the order in which they are returned, as ranges of consecutive ids.
     runs: Vec<Range<usize>>,
 }
 

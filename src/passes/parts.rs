@@ -9,8 +9,8 @@ use crate::model::{Attributes, Gaussians};
 pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> BlockSlices<'a> {
-    /// Resizes the attributes `want` of `state` to `count` Gaussians. Divides their values into mutable slices, one set
-    /// for each block of [`GAUSSIANS_PER_BLOCK`] Gaussians, and returns these sets in order.
+    /// Resizes the attributes `want` of `state` to `count` Gaussians, and divides their arrays into mutable slices.
+    /// Returns one set of slices for each block of [`GAUSSIANS_PER_BLOCK`] Gaussians, in the order of the blocks.
     pub fn split(state: &'a mut Gaussians, want: Attributes, count: usize) -> Vec<BlockSlices<'a>> {
         let mut parts: Vec<BlockSlices<'a>> =
             (0..count.div_ceil(GAUSSIANS_PER_BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
@@ -23,8 +23,8 @@ impl<'a> BlockSlices<'a> {
         parts
     }
 
-    /// Copies the attributes `want` of `block` to these slices. [`BlockSlices::split`] must have made them for the same
-    /// attributes.
+    /// Copies the attributes `want` of `block`, the Gaussians of one block, into these slices. [`BlockSlices::split`]
+    /// must have made the slices for the same attributes.
     pub fn write(self, block: &Gaussians, want: Attributes) {
         let columns = want.iter().map(|column| block.column(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));

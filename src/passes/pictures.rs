@@ -19,7 +19,7 @@ use crate::model::{AttributeValues, Attributes, Camera, FrameView, Gaussians};
 use crate::render::{Image, blend_features, render};
 use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 
-/// Number of views per thread in a batch: enough that waiting for the last view to finish costs little time.
+/// Number of views per thread in a batch. With fewer, threads would wait longer for the last view of each batch.
 pub const VIEWS_PER_THREAD: usize = 4;
 
 /// Selection of the Gaussians of a frame source to render, and of the attributes to read for this.
@@ -235,9 +235,9 @@ pub fn for_each_view_batch<const S: usize>(
 /// per thread works at a time.
 ///
 /// Memory per Gaussian:
-/// - its share of a reader;
+/// - the memory of the reader of the frames, per Gaussian;
 /// - its attributes at each frame of a batch (at most 4 × threads views and [`Limits::frames_together`] frames);
-/// - its share of the data of each worker; there are at most [`Limits::views_together`] workers.
+/// - the memory of all workers, per Gaussian; there are at most [`Limits::views_together`] workers.
 pub(crate) struct Workers<W> {
     limits: Limits,
     /// Workers that process no view at the moment.

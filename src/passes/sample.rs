@@ -30,10 +30,10 @@ pub struct ViewSampler {
 }
 
 impl ViewSampler {
-    /// Creates a sampler with the strides `frame_stride` and `view_stride` of `scan`. Of the frames that have views, it
-    /// selects the first and then every `frame_stride`-th. Of the views of a selected frame, it selects every
-    /// `view_stride`-th. The number of views skipped before the first one grows by one from each selected frame to the
-    /// next (modulo `view_stride`), so that all views are selected in turn.
+    /// Creates a sampler with the strides `frame_stride` and `view_stride` of `scan`. It selects the first frame that
+    /// has views, then every `frame_stride`-th of these frames. In a selected frame, it selects every `view_stride`-th
+    /// view. Each selected frame starts one view later than the one before (modulo `view_stride`), so that all views
+    /// are selected in turn.
     pub fn new(scan: &recipe::ScanParams) -> Self {
         Self::with_strides(scan.frame_stride.get() as usize, scan.view_stride.get() as usize)
     }
@@ -71,9 +71,9 @@ impl ViewSampler {
 
 /// Returns the views of `schedule` that a scoring pass with the parameters `scan` renders.
 ///
-/// A [`ViewSampler`] selects views by the strides of `scan`. If there are more of these than `look_pictures`, the
-/// maximum number of views in `scan` (0: no maximum), [`select_evenly_over_frames`] selects that number of them, from
-/// at least `frames` frames if possible.
+/// A [`ViewSampler`] selects views by the strides of `scan`. If they are more than the maximum in `scan`
+/// (`look_pictures`, where 0 stands for no maximum), [`select_evenly_over_frames`] selects this maximum number of them,
+/// from at least `frames` frames if possible.
 pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
     let left = ViewSampler::new(scan).thin(schedule);
     if scan.look_pictures == 0 || left.pair_count() <= scan.look_pictures {

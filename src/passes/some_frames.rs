@@ -20,8 +20,8 @@ impl<'a> SomeFrames<'a> {
         SomeFrames { source, info: SequenceInfo { times, ..source.info().clone() }, frames }
     }
 
-    /// Returns the part of `schedule` for the chosen frames. `schedule` is the schedule of the original source, with
-    /// all frames.
+    /// Returns the schedule (list of the views at each frame) of this source. `schedule` is the schedule of the
+    /// original source, with all its frames.
     pub fn views(&self, schedule: &ViewSchedule) -> ViewSchedule {
         let mut chosen = ViewSchedule::new(schedule.cameras.clone());
         self.frames.iter().for_each(|&frame| chosen.push_frames(1, schedule.views(frame)));

@@ -63,16 +63,17 @@ fn compress_whole(request: &Request) -> Result<Summary> {
 /// the run, and for every input Gaussian its index in the output (`None` if it was removed).
 ///
 /// # Errors
-/// Fails in the cases in which [`compress`] fails. A run of only one shard ends with [`Error::ShardDone`].
+/// Fails in the cases in which [`compress`] fails. A run of only one shard (part of a divided stage) ends with
+/// [`Error::ShardDone`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     plan.check_target(&scene.path)?;
     run_stages(scene, &plan, None, request, Journal::default())
 }
 
-/// Returns a line of text for each divisible stage of a run of `request`, in the order in which the stages run. Several
-/// processes can share the work of a divisible stage. The line holds the name of the stage and its number of units of
-/// work, such as blocks of Gaussians or views. Opens the input, but reads nothing else.
+/// Returns one line of text for each divisible stage of a run of `request`, in the order in which the stages run. A
+/// stage is divisible if several processes can share its work. A line holds the name of the stage and its number of
+/// units of work, such as blocks of Gaussians or views. Only opens the input; runs no stage.
 ///
 /// # Errors
 /// Fails if the input cannot be opened, if the request is invalid, or if the memory budget is too small for it.
@@ -84,8 +85,8 @@ pub fn shardable_stages(request: &Request) -> Result<Vec<String>> {
     Ok(plan.shardable_units(&scene))
 }
 
-/// Sets the memory limits of the open scene `scene` so that a run of `request` stays within the memory budget that the
-/// request states.
+/// Sets how many frames, views and pairs of Gaussians the stages of a run of `request` may keep in memory at a time,
+/// and stores these limits in the open scene `scene`. With them, the run stays within the memory budget of `request`.
 ///
 /// # Errors
 /// Fails if the budget is too small for the run, and in the cases in which [`RunPlan::new`] fails.
@@ -149,7 +150,7 @@ fn run_stages(
 }
 
 /// Returns the text of the file `recipe.toml` that is written beside the result. `own` is the digest of the input of
-/// this run. Adds a note to `journal` if the recipe was made for an input with another digest.
+/// this run. Adds a note to `journal`, the record of the run, if the recipe was made for an input with another digest.
 fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journal) -> String {
     if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != own) {
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));

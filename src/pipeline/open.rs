@@ -41,9 +41,12 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens the scene that `options` describe. Limits what the stages of the run keep in memory, so that the run stays
-/// within the memory budget. The function `plan` makes the plan of the run from facts about the scene. For a stream,
-/// the function is called before any frame is read, unless frames have to be linked (see [`is_linked`]).
+/// Opens the scene that `options` describe, and limits what the stages of the run keep in memory, so that the run stays
+/// within the memory budget. The function `plan` makes the plan of the run from facts about the scene. The input
+/// determines when it is called:
+/// - stream: before any frame is read;
+/// - stream whose Gaussians have to be matched between frames ([`is_linked`]): after all frames are read;
+/// - other input: after it is opened.
 ///
 /// Returns the scene and the plan of the run. Also returns the statistics of the Gaussians if the input is a stream and
 /// they were computed while it arrived (see [`receive_measured`]).
@@ -108,11 +111,14 @@ fn send_forecast(
     Ok(())
 }
 
-/// Packs a stream into a scratch container. If memory suffices, also computes the statistics of the Gaussians while the
-/// frames arrive. `loaded` holds the user's cameras, if any. `plan` makes the plan of the run from facts about the
-/// scene. Returns the scene, the plan of the run, and the statistics. The statistics are `None` if memory did not
-/// suffice, if an assumption about the times of the stream (see the module) proved wrong, or if Gaussians with NaN or
-/// infinity have to be dropped.
+/// Receives a stream, packs its frames into a scratch container, and opens the container as a scene. If memory
+/// suffices, also computes the statistics of the Gaussians while the frames arrive. `loaded`: cameras given by the
+/// user, if any. `plan`: function that makes the plan of the run from facts about the scene.
+///
+/// Returns the scene, the plan of the run, and the statistics. The statistics are `None` in three cases:
+/// - memory did not suffice;
+/// - an assumption about the times of the stream (see the module) proved wrong;
+/// - Gaussians with NaN or infinity have to be dropped.
 fn receive_measured(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
@@ -209,7 +215,7 @@ fn receive_measured(
 /// - forecast ([`Verbosity::Time`]): `peak`, the maximum memory of the run, bytes;
 /// - plan ([`Verbosity::Plan`]): `most`, the maximum number of frames that fit the memory limit, and `to_measure`, the
 ///   maximum number of frames for which memory suffices to compute statistics while they arrive;
-/// - neither: no message is sent.
+/// - nothing ([`Verbosity::Nothing`]): no message is sent.
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {
@@ -223,9 +229,9 @@ fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64
     options.events.send(Message::Plan(&text));
 }
 
-/// Completes the statistics that were computed while the frames arrived, and returns them. Returns `None`, and adds a
-/// note to the scene, if an assumption about the times of the stream proved wrong, or if Gaussians with NaN or infinity
-/// have to be dropped.
+/// Completes the statistics that were computed while the frames of a stream arrived, and returns them. Returns `None`
+/// if they cannot be used: an assumption about the times of the stream proved wrong, or Gaussians with NaN or infinity
+/// have to be dropped. Then adds the reason as a note to `scene`.
 fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &mut Scene) -> Result<Option<Measured>> {
     let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
     let found = match measuring.failed_assumption(&complete, scene) {
@@ -301,8 +307,8 @@ impl<'a> Measuring<'a> {
         Ok(())
     }
 
-    /// Returns a description of the assumption about the times of the stream that proved wrong, if any. `complete` is
-    /// the plan of the scan made from the times of all frames.
+    /// Returns a text for the user that names the assumption about the times of the stream that proved wrong; `None` if
+    /// all assumptions hold. `complete`: plan of the scan, made from the times of all frames.
     fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
         if !complete.fits_scan_begun_with(self.plan) {
             return Some("the frames are not evenly spaced in time");
@@ -315,8 +321,8 @@ impl<'a> Measuring<'a> {
     }
 }
 
-/// Rule that assigns views to the frames of a stream while later frames are unknown: a frame gets the views of the rig
-/// that have exactly its time, and all views without a time.
+/// Rule that assigns views to a frame of a stream before the times of later frames are known. A frame gets the views of
+/// the rig that have exactly its time, and all views without a time.
 struct AssumedTimes<'a> {
     rig: &'a Rig,
     /// Time and index in the rig of each view that belongs to the requested split and has a time; sorted by time, then
@@ -341,7 +347,8 @@ impl<'a> AssumedTimes<'a> {
         AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
     }
 
-    /// Returns the views of a frame at `time`, each as its view number and camera index, in the order of the rig.
+    /// Returns the views of a frame at the time `time`, in the order of the rig (set of cameras). A view is a pair: its
+    /// view number, then the index of its camera.
     fn at(&self, time: f64) -> Vec<(u32, u32)> {
         let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);

@@ -58,12 +58,15 @@ impl RunPlan {
         plan
     }
 
-    /// Returns the plan of a run within the memory limit of `request`. If the plan does not fit, refinement is reduced
-    /// step by step until it does. First, parameter deltas (values that refinement adds to stored parameters) become
-    /// constant in time. Then SH coefficients above degree 0 are not refined. Then nothing is refined. If even a run
-    /// without refinement exceeds the limit, the plan with full refinement is returned; it is refused later with an
-    /// error that names the smallest sufficient limit. The plan includes the measurement of the quality of the result
-    /// if there is memory for it.
+    /// Returns the plan of a run that stays within the memory limit of `request`. If full refinement does not fit,
+    /// tries smaller plans in this order, and returns the first one that fits:
+    /// - parameter deltas (values that refinement adds to stored parameters) are constant in time;
+    /// - also, SH coefficients above degree 0 are not refined;
+    /// - nothing is refined.
+    ///
+    /// If none of them fits, returns the plan with full refinement. It is refused later with an error that names the
+    /// smallest sufficient limit. The plan includes the measurement of the quality of the result if there is memory for
+    /// it.
     ///
     /// # Errors
     /// Fails in the cases in which [`RunPlan::new`] fails.
@@ -192,16 +195,16 @@ impl RunPlan {
         self.estimates_where(self.estimate_input(work, limits, measured), |_| true)
     }
 
-    /// Returns the resource estimates (memory, time, reads) of all stages except the optional ones, which only report
-    /// something.
+    /// Returns the resource estimates (memory, time, reads) of all stages that the run needs for its result. Leaves out
+    /// optional stages, which only report something, such as the quality of the result.
     pub fn required_estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         let input = self.estimate_input(work, limits, MeasuredOnArrival::default());
         self.estimates_where(input, |stage| !stage.is_optional())
     }
 
     /// Returns the resource estimates (memory, time, reads) of the stages that certainly have to run. Leaves out stages
-    /// that may turn out to be unnecessary because the run removes only Gaussians that hardly change renders.
-    /// `hardly_seen` is the fraction of such Gaussians.
+    /// that are unnecessary if the run removes only Gaussians that hardly change renders. `hardly_seen`: fraction of
+    /// the Gaussians that can be removed before the PSNR of renders falls below 60 dB.
     pub fn shortest_estimates(
         &self,
         work: &Workload,
@@ -239,9 +242,9 @@ impl RunPlan {
         self.search.is_some() || self.stages.has_uncertain_duration()
     }
 
-    /// Returns a line of text for each divisible stage, whose work several processes can share. The line holds the name
-    /// of the cache entries of the stage (files with results) and its number of units of work, such as blocks of
-    /// Gaussians or views.
+    /// Returns one line of text for each divisible stage (a stage whose work several processes can share). A line holds
+    /// the name under which the stage caches its results, and its number of units of work, such as blocks of Gaussians
+    /// or views.
     pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
         self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
     }

@@ -19,7 +19,7 @@ pub struct InputMeta {
 }
 
 impl InputMeta {
-    /// Returns the facts about the open scene `scene`.
+    /// Returns the facts about the open scene `scene` that are known before its frames are read.
     pub fn from_scene(scene: &Scene) -> InputMeta {
         InputMeta {
             gaussians: scene.source().info().count,

@@ -16,8 +16,8 @@ use crate::source::FrameSource;
 
 /// Images with which renders of a compressed model are compared.
 pub(super) enum QualityReference<'a> {
-    /// Renders of the original model. Second field: for each view of the quality meter, the index of its render among
-    /// the stored renders.
+    /// Renders of the original model. First field: stored renders. Second field: for each view of the quality meter,
+    /// the index of its render among the stored renders.
     Original(&'a Targets, Vec<usize>),
     /// Photographs of the scene.
     Photographs(Photographs),
@@ -28,16 +28,16 @@ pub(super) enum QualityReference<'a> {
 pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
-    /// Views in order of frames. The flag of a view is true if the view is held back from the search for the smallest
-    /// model.
+    /// Views, in order of frames. Second element of each pair: whether the view is held back from the search for the
+    /// smallest model, to report the quality.
     pictures: Vec<(FrameView, bool)>,
     comparison: QualityReference<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
-    /// Creates a quality meter that compares models on the views `pictures`, which are in order of frames. The flag of
-    /// a view is true if the view is held back from the search for the smallest model. `comparison` holds the images
-    /// with which renders are compared.
+    /// Creates a quality meter, which measures the PSNR of compressed models on the views `pictures`. These are in
+    /// order of frames. Second element of each pair: whether the view is held back from the search for the smallest
+    /// model, to report the quality. `comparison` holds the images with which renders of the models are compared.
     ///
     /// # Errors
     /// Fails if no view is held back from the search, or if every view is.
@@ -59,8 +59,8 @@ impl<'a> QualityMeter<'a> {
     }
 
     /// Returns the mean PSNR, dB, of renders of the model `source` against the images of the meter (renders of the
-    /// original, or photographs). If `held`, measures on the views held back from the search, otherwise on the views of
-    /// the search.
+    /// original, or photographs). If `held` is true, uses the views that are held back from the search for the smallest
+    /// model; otherwise uses the views of the search.
     ///
     /// # Errors
     /// Fails if frames or photographs cannot be read.

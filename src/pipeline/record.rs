@@ -42,7 +42,8 @@ pub struct RunOptions {
     /// Maximum amount, dB, by which the mean PSNR against photographs may be lower for the output than for the original
     /// model.
     pub max_loss: Option<f64>,
-    /// Folder of the photographs for `max_loss`. In a recipe file the path is relative to the folder of the file.
+    /// Folder of the photographs with which renders are compared for the limit `max_loss` (maximum loss of PSNR against
+    /// photographs). In a recipe file the path is relative to the folder of the file.
     pub ground_truth: Option<PathBuf>,
     /// Maximum number of bytes of all output files together.
     pub target_size: Option<u64>,
@@ -58,8 +59,8 @@ pub struct RunOptions {
     pub output: Option<OutputKind>,
     /// Training iteration whose files are read, if the input is a model folder with the files of several iterations.
     pub iteration: Option<u32>,
-    /// Value of the option `--time-duration`: length of the training parameter `time_duration` of 4D Gaussian
-    /// Splatting, in the model's time unit. Colors of the input repeat after this period.
+    /// Value of the option `--time-duration`: length of the time interval `time_duration` with which a 4D Gaussian
+    /// Splatting model was trained, in the model's time unit. Colors of the input repeat after this period.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time_duration: Option<f64>,
     /// Whether the option `--rot4d unflipped` was given: the 4D rotations of the input use the axis order of 4D

@@ -72,13 +72,14 @@ pub struct SearchStage {
     /// Quality that the search must reach. For an archive it is higher than requested, because quantization costs
     /// quality.
     searched: Quality,
-    /// Number of views of the original to which models are fitted by refinement and with which their renders are
-    /// compared.
+    /// Number of target views (renders of the original model). Refinement fits models to some of them; the quality of
+    /// the models is measured on others.
     pictures: usize,
     /// Refinement stage, which is run at every size; `None` if nothing is refined.
     refine: Option<RefineStage>,
-    /// PSNR margins, dB, that two reductions of the model require. First: for storing the deformation field in half
-    /// precision; `None` if the field stays exact. Second: for dropping SH degrees; `None` if all degrees stay.
+    /// Margins of PSNR, dB, that decide about two optional reductions of the model. First: storing the deformation
+    /// field in half precision ([`FieldPrecisionStage::margin`]); `None` if the field stays exact. Second: dropping SH
+    /// degrees ([`ShDegreeStage::margin`]); `None` if all degrees stay.
     margins: [Option<f64>; 2],
 }
 
@@ -204,10 +205,11 @@ impl SearchStage {
         Ok(())
     }
 
-    /// Returns the meter that measures the quality of models. If `photographs` is given (test views with their
-    /// photographs), the meter compares renders with the photographs. Otherwise it compares renders with `targets`, the
-    /// stored renders of the original. `parts` then states which target views the search may use and which are held
-    /// back from it.
+    /// Returns the meter that measures the quality of models during the search:
+    /// - If `photographs` is given (test views with their photographs), the meter compares renders with the
+    ///   photographs. It holds one of every [`HELD_EVERY`] views back from the search.
+    /// - Otherwise it compares renders with `targets`, the stored renders of the original. The search uses the
+    ///   validation views of `parts`; the test views of `parts` are held back.
     fn meter<'a>(
         &self,
         scene: &'a Scene,
@@ -257,7 +259,8 @@ impl SearchStage {
         )))
     }
 
-    /// Checks, before any work, that there are enough photographs if a maximum loss against photographs is requested.
+    /// Checks, before any work, that at least [`HELD_EVERY`] test views have photographs if a maximum loss against
+    /// photographs is requested.
     ///
     /// # Errors
     /// Fails if photographs are missing or too few.
@@ -282,9 +285,10 @@ impl SearchStage {
     }
 
     /// Tries sizes (numbers of Gaussians) from the number of protected Gaussians, which are always kept, to the number
-    /// of Gaussians in the ranking. Returns the smallest tried model that has the requested quality. If no tried model
-    /// has it, returns the model of all Gaussians in the ranking. Also returns every tried size with the quality of its
-    /// model, dB (see [`TriedSize::value`]).
+    /// of Gaussians in the ranking. Returns two values:
+    /// - the smallest tried model that has the requested quality; if none has it, the model of all Gaussians in the
+    ///   ranking;
+    /// - every tried size with the quality of its model, dB (see [`TriedSize::value`]).
     fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
         let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
@@ -327,7 +331,7 @@ impl SearchStage {
     }
 
     /// Runs the stages that reduce the model to `size` Gaussians, and measures the quality of the result on the views
-    /// that the search uses. Returns the model with its quality and its journal.
+    /// that the search uses. Returns the model, with its quality and the journal (log) of these stages.
     fn try_size(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>, size: usize) -> Result<TriedSize> {
         (trial.journal, trial.target) = (Journal::default(), Some(size));
         trial.stages.run(Phase::Reduce, trial)?;

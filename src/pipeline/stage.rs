@@ -71,8 +71,9 @@ pub trait Stage: Debug + Send + Sync {
     }
 
     /// Returns whether the stage may turn out to be unnecessary because the run removes only Gaussians that hardly
-    /// change renders. `_hardly_seen` is the fraction of such Gaussians. The lower bound of the estimated time of a run
-    /// leaves out stages for which this method returns true.
+    /// change renders. The lower bound of the estimated time of a run leaves out stages for which this method returns
+    /// true. `_hardly_seen`: fraction of the Gaussians that can be removed before the PSNR of renders falls below 60
+    /// dB.
     fn may_be_skipped(&self, _input: EstimateInput<'_>, _hardly_seen: f64) -> bool {
         false
     }
@@ -99,9 +100,9 @@ pub trait Stage: Debug + Send + Sync {
         Ok(())
     }
 
-    /// Runs the stage: takes its input from `run`, stores its results in `run`, and adds its entries to the journal of
-    /// `run`. Results are cached under a key of the stage, so that a run that is repeated after an interruption does
-    /// not compute them again.
+    /// Runs the stage: takes its input from `run`, stores its results in `run`, and adds entries to the journal of
+    /// `run` (log from which the summary is made). Results are cached under a key of the stage, so that a run that is
+    /// repeated after an interruption does not compute them again.
     ///
     /// # Errors
     /// Fails if the input cannot be read, the output cannot be written, or the input cannot meet the request.
@@ -216,13 +217,14 @@ impl StageList {
         self.stages.push((phase, Box::new(stage)));
     }
 
-    /// Records that the run omits the work `what` for the reason `why`. How much this saves is not known.
+    /// Records that the run omits the work `what` (its name for display) for the reason `why`. The memory and time that
+    /// this saves are not known.
     pub fn leave_out(&mut self, what: &'static str, why: impl Into<String>) {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: None });
     }
 
-    /// Records that the run omits the stage `what` for the reason `why`. `estimate` returns the memory, time and reads
-    /// that this saves.
+    /// Records that the run omits the stage `what` (its name for display) for the reason `why`. `estimate` returns the
+    /// memory, time and reads that the omission saves.
     pub fn leave_out_stage(
         &mut self,
         what: &'static str,
@@ -270,8 +272,9 @@ impl StageList {
         self.left_out.iter().map(|left| format!("left out: {} ({})", left.what, left.why))
     }
 
-    /// Adds the omitted stages with their reasons to the journal. If an estimate exists for a stage, also adds the time
-    /// and the reads that are saved, for an input of the sizes `work` within `limits`.
+    /// Adds the omitted stages with their reasons to `journal`, the log of the run. If an estimate exists for a stage,
+    /// also adds the time and the reads that are saved, for an input of the sizes `work` and the memory limits
+    /// `limits`.
     pub fn record_left_out(&self, work: &Workload, limits: &Limits, journal: &mut Journal) {
         for LeftOutStage { what, why, estimate } in &self.left_out {
             match estimate.as_ref().map(|estimate| estimate(work, limits)) {
@@ -291,8 +294,8 @@ impl StageList {
 pub enum PreparedArchive {
     /// Encoded model or point cloud, ready to be written.
     Content(EncodedArchive),
-    /// Error bounds of the values in an archive of frames. The frames are computed and rounded within these bounds only
-    /// when the archive is written.
+    /// Error bounds of the values in an archive of frames, which stores the Gaussians at every frame instead of a
+    /// model. The frames are computed and rounded within these bounds only when the archive is written.
     Frames(ErrorBounds),
 }
 

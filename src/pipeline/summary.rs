@@ -68,11 +68,13 @@ pub struct ArchiveSummary {
     /// Number of bits that each attribute and each tensor takes in the archive, by name; empty for an archive of
     /// frames.
     pub bits: BTreeMap<String, f64>,
-    /// Measurements from which the quantization steps were derived, one entry for each attribute or tensor:
-    /// - its name;
-    /// - log2 of its quantization step (in an archive of frames: of twice its error bound);
-    /// - squared error of renders if it alone is quantized with this step;
-    /// - number of bits that it takes with this step (in an archive of frames: in some blocks of Gaussians only).
+    /// Measurements from which the quantization steps were derived, one entry for each attribute or tensor. Elements of
+    /// an entry, in order:
+    /// - name of the attribute or tensor;
+    /// - log2 of its quantization step; in an archive of frames, log2 of twice its error bound;
+    /// - mean squared error of renders if only this attribute or tensor is quantized, with this step;
+    /// - number of bits that it takes with this step; in an archive of frames, counted in some blocks of Gaussians
+    ///   only.
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 
@@ -167,19 +169,21 @@ pub struct MergeSummary {
     pub reference_frame: usize,
     /// Number of proxies in the output (Gaussians that replace merged clusters).
     pub proxies: usize,
-    /// Number of Gaussians that were merged into proxies.
+    /// Number of Gaussians that were merged, each into a proxy (Gaussian that replaces a cluster).
     pub members: usize,
-    /// Rule for the opacity of a proxy.
+    /// Rule by which the opacity of a proxy (Gaussian that replaces a merged cluster) is computed.
     pub opacity: ProxyOpacity,
     /// Statistics of every merge pass, in order: numbers of candidate pairs, of joins, and others.
     pub passes: Vec<PassCounts>,
-    /// Largest distance between the position of a proxy and the position expected from its members, over all proxies
-    /// and sampled frames, in scene units. `None` if every proxy follows its members exactly.
+    /// Largest distance between the position of a proxy (Gaussian that replaces a cluster) and the position expected
+    /// from the members of the cluster, over all proxies and sampled frames, in scene units. `None` if every proxy
+    /// follows its members exactly.
     pub deviation: Option<f64>,
 }
 
 impl MergeSummary {
-    /// Sets the numbers of proxies and of merged Gaussians from `clusters`, the merged clusters.
+    /// Sets the numbers of proxies (Gaussians that replace merged clusters) and of merged Gaussians from `clusters`,
+    /// the merged clusters.
     pub(super) fn count(&mut self, clusters: &[Cluster]) {
         self.proxies = clusters.len();
         self.members = clusters.iter().map(|cluster| cluster.members.len()).sum();
@@ -231,7 +235,7 @@ pub struct Summary {
     pub stages: Vec<StageRecord>,
     /// Percentiles of every term of the score by which Gaussians were ranked.
     pub terms: Vec<TermSummary>,
-    /// Numbers of Gaussians with unusual values, by kind.
+    /// Number of Gaussians with unusual values, for each kind of unusual value (such as NaN).
     pub flags: FlagSummary,
     /// Numbers of Gaussians that were merged (stage 3 of the paper); `None` if nothing was merged.
     pub merge: Option<MergeSummary>,

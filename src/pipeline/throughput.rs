@@ -38,8 +38,9 @@ const VIEWS_PER_THREAD: usize = 2;
 const MIN_RUN_SECONDS: f64 = 2.0;
 
 /// Returns the forecast (expected time and memory) of a run of `stages` with the memory plan `plan`. `measured` states
-/// which kinds of statistics were already computed; their time is not counted. Calibrates first unless the run is
-/// short, and stores the measured speed in `scene`, whose limits must already be those of `plan`.
+/// which kinds of statistics were already computed; their time is not counted. If the run is expected to take at least
+/// [`MIN_RUN_SECONDS`], measures the speed of this machine first, and stores it in `scene`. The limits of `scene` must
+/// already be those of `plan`.
 ///
 /// # Errors
 /// Fails if frames cannot be read.
@@ -64,7 +65,8 @@ pub(super) fn forecast(
 struct Calibration {
     /// Measured factors by which work takes longer on this machine than is assumed without a calibration.
     pace: Throughput,
-    /// Fraction of the Gaussians whose removal hardly changes renders; 0 if no view was rendered.
+    /// Fraction of the Gaussians that can be removed before the PSNR of renders falls below [`MAX_USEFUL_PSNR`]; 0 if
+    /// no view was rendered.
     hardly_seen: f64,
 }
 
@@ -107,9 +109,10 @@ impl Calibration {
         Ok(found)
     }
 
-    /// Renders views of one frame. Updates `pace`, the time factors for views, and `hardly_seen`, the fraction of the
-    /// Gaussians whose removal hardly changes renders. `expected` holds the estimated core-seconds for computing
-    /// contributions, computing removal errors, and rendering images. The measured time is added to `spent`.
+    /// Renders views of one frame to measure the speed of three kinds of work, in this order: computing contributions,
+    /// computing removal errors, rendering images. `expected` holds the estimated core-seconds of each kind. Updates
+    /// `pace` (measured time divided by estimated time, for each kind) and `hardly_seen` (fraction of the Gaussians
+    /// whose removal hardly changes renders). The measured time is added to `spent`.
     fn render_views(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut MeasuredTime) -> Result<()> {
         let schedule = &scene.schedule;
         let middle = schedule.iter().count() / 2;
@@ -226,7 +229,8 @@ impl MeasuredTime {
         Some(processors)
     }
 
-    /// Returns the average number of busy processors during the measurements; `None` if these took almost no time.
+    /// Returns the average number of busy processors during the measurements, from 0.1 to `threads`; `None` if the
+    /// measurements took at most 0.01 s.
     fn processors(&self, threads: u64) -> Option<f64> {
         (self.wall > 0.01).then(|| (self.processors / self.wall).clamp(0.1, threads as f64))
     }

@@ -54,7 +54,7 @@ pub struct PageModel {
     pub name: String,
     /// Size of the model on disk in bytes.
     pub bytes: u64,
-    /// Number of frames of the model.
+    /// Number of frames of the model; the page may show fewer.
     pub frames: usize,
     /// SH degree of the model.
     pub degree: usize,
@@ -129,7 +129,7 @@ pub struct PageCamera {
     focal: [f64; 2],
     principal: [f64; 2],
     near: f64,
-    /// Rows of the rotation from world to camera.
+    /// Rotation matrix from world to camera coordinates, row by row.
     rotation: [[f64; 3]; 3],
     eye: [f64; 3],
 }

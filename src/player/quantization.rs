@@ -1,8 +1,9 @@
 //! Quantization of frame states for the page that plays a scene. Every value becomes the nearest point of a grid, so
 //! that differences between frames are small integers that repeat.
 //!
-//! Input: the Gaussians of one frame. Output: multiples of quantization steps as i32. They form planes (one scalar
-//! component of all Gaussians), one after another. Memory: one plane per component.
+//! Input: the Gaussians of one frame. Output: their values as multiples of quantization steps (i32). The output
+//! consists of planes, one after another; a plane has one scalar component (such as the x of the position) of all
+//! Gaussians. Memory: one plane per component.
 
 use std::ops::Range;
 
@@ -28,9 +29,9 @@ pub struct PlayerSteps {
     pub sh: f64,
 }
 
-/// Number of binary digits of a position. The quantization step of positions is 2^−14 times the scene's extent, which
-/// is first rounded down to a power of two. In a render of the whole scene on 800 pixels, positions are off by at most
-/// a fortieth of a pixel.
+/// Number of binary digits of a position. The quantization step of positions is 2^−14 · E, where E is the scene extent
+/// rounded down to a power of two. In a render of the whole scene on 800 pixels, positions are off by at most a
+/// fortieth of a pixel.
 const POSITION_BITS: i32 = 14;
 /// Largest absolute value of a log scale on the player page, as in the rasterizer; other values are clamped.
 const LOGARITHM_LIMIT: f32 = 80.0;
@@ -74,9 +75,10 @@ pub fn component_count(sh_degree: usize) -> usize {
 /// `[components, N]`. Leaves the other attributes in `points` as they are. Returns the number of Gaussians that become
 /// invisible.
 ///
-/// Quaternions are normalized and get the sign that is closer to the earlier content of `points`. A Gaussian gets
-/// opacity 0, and is invisible, if one of its values is NaN or if its position is infinite or too far away for the
-/// integers.
+/// - Quaternions are normalized. Of the two signs of a quaternion, the one closer to the earlier content of `points` is
+///   taken.
+/// - A Gaussian gets opacity 0, and is invisible, if one of its values is NaN or if a coordinate of its position is at
+///   least [`POSITION_LIMIT`] quantization steps away from 0.
 ///
 /// # Panics
 /// Panics if `points` has fewer than components × N values.

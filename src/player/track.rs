@@ -1,4 +1,5 @@
-//! Encoding of a sequence for the page: a first state, then groups of frames as differences in time.
+//! Encoding of a sequence of frames for the player page as chunks of bytes: first a chunk with the first frame, then
+//! one chunk per group of frames, as differences in time.
 //!
 //! Input: a source of frames. Output: chunks of bytes, in order. Memory: one state, and the quantized values of the
 //! frames of one group, which are at most [`MAX_VALUES_PER_FRAME_GROUP`] unless the group has only one frame.
@@ -56,7 +57,8 @@ pub struct PageSequence {
     /// Scalar components of a Gaussian that vary with time, as ranges in increasing order: index of the first
     /// component, and number of components.
     pub varying: Vec<[usize; 2]>,
-    /// Index of the first frame of each group, followed by the total number of frames.
+    /// Index of the first frame of each group, followed by the total number of frames. Frame 0 is stored separately and
+    /// belongs to no group.
     pub groups: Vec<usize>,
     /// Largest number of Gaussians that are invisible in one frame of the page, because a value is NaN or a position is
     /// too far away for the quantization grid.
@@ -96,16 +98,17 @@ impl PageSequence {
     }
 }
 
-/// Returns the attributes that are encoded for every frame, given the attributes `varying` that vary with time. If any
-/// attribute varies, opacity is added, because a Gaussian may have values that cannot be shown at some frames, and its
-/// opacity is then 0 at these frames.
+/// Returns the attributes that are encoded for every frame. These are the attributes that vary with time (`varying`)
+/// and, if there are any, the opacity. The opacity is needed because a Gaussian is hidden by opacity 0 at frames where
+/// it has values that cannot be shown.
 fn changing(varying: Attributes) -> Attributes {
     if varying.is_empty() { varying } else { varying | Attributes::OPACITY }
 }
 
-/// Encodes the frames `frames` of `source`, for which `track` was planned. Passes each chunk with its index to `sink`,
-/// in order. Stores the largest number of invisible Gaussians in `track.unseen`. Some sources decode several frames
-/// together; at most `held` decoded frames are then kept in memory.
+/// Encodes the frames `frames` of `source` for the player page. `track` is the description of the sequence, planned for
+/// these frames. Passes each chunk with its index to `sink`, in order. Stores the largest number of invisible Gaussians
+/// in `track.unseen`. Some sources decode several frames together; at most `held` decoded frames are then kept in
+/// memory.
 ///
 /// # Errors
 /// Fails if a frame cannot be read, if a position cannot be stored accurately, or if `sink` fails.
@@ -164,9 +167,9 @@ pub fn encode(
     Ok(())
 }
 
-/// Encodes scalar components (such as the x of the position) as a compressed chunk. An item of `components` is one
-/// component: the values of all Gaussians at the first frame of the sequence, and their values at every frame of the
-/// chunk; all values are quantized.
+/// Encodes scalar components (such as the x of the position) as a compressed chunk. Each item of `components` is a pair
+/// of quantized values of one component: the values of all Gaussians at the first frame of the sequence, and a list of
+/// their values at every frame of the chunk.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
     let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));
@@ -195,10 +198,12 @@ fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     bytes
 }
 
-/// Returns the differences between successive frames, Gaussian by Gaussian, each with its sign in the lowest bit. The
-/// first difference of a Gaussian is relative to `start`, the others to the frame before. If `is_second`, the third and
-/// later differences are relative to an extrapolated value instead: the frame before, plus its change since the frame
-/// before that.
+/// Returns the differences of one component between successive frames, Gaussian by Gaussian. A difference d is returned
+/// as 2d, or as −2d − 1 if it is negative. A value of a Gaussian is compared with:
+/// - its value in `start`, if it is the first value;
+/// - its value at the frame before, if it is the second value, or a later value and `is_second` is false;
+/// - the linear extrapolation of its two values before, if it is a later value and `is_second` is true. Steady motion
+///   then gives 0.
 fn differences(start: &[i32], frames: &[&[i32]], is_second: bool) -> Vec<u32> {
     let mut values = Vec::with_capacity(start.len() * frames.len());
     for (i, &first) in start.iter().enumerate() {
@@ -225,8 +230,8 @@ mod tests {
     use crate::diagnostics::demo_scene;
     use crate::passes::gather_all;
 
-    /// Decodes every frame of the chunks, `[frames][width][N]`, one value at a time, by the description at the top of
-    /// this file; shares no code with the encoder.
+    /// Decodes the chunks and returns the values `[frames][components][N]` of every frame. Works value by value as the
+    /// description at the top of this file says, and shares no code with the encoder.
     fn unpacked(track: &PageSequence, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
         let (count, width) = (track.count, component_count(track.sh_degree));
         let chunk = |k: usize, moving: &[usize], frames: usize, base: &[Vec<i64>]| {

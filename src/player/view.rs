@@ -163,7 +163,8 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     Ok(ViewReport { page: folder.join(INDEX_FILE), bytes, files: names.len(), frames, notes })
 }
 
-/// Settings for one model of the page: its role, path, maximum number of frames and maximum SH degree.
+/// Settings for one model on the page: its role (`original` or `compressed`), its path, the maximum number of frames
+/// and the maximum SH degree.
 struct ModelView<'a> {
     role: &'static str,
     path: &'a Path,

@@ -66,7 +66,8 @@ pub fn visible_contribution(
 /// Running sums of the contributions of every Gaussian to all views rendered so far.
 ///
 /// Memory per Gaussian:
-/// - 44 bytes for its state at each frame of a batch (frames that have 4 × threads views together, within `limits`);
+/// - 44 bytes for its state at each frame of a batch; a batch has at most 4 × threads views, of at most
+///   [`Limits::frames_together`] frames;
 /// - 44 bytes for its state while its block of Gaussians is read;
 /// - for each view rendered at the same time, 12 bytes of sums and the buffers of the view ([`crate::render`]).
 pub struct RunningContribution {

@@ -118,8 +118,10 @@ fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }
 
-/// Returns `x`/`tau` if `tau` > 0; the quotient is at least 1 exactly if `x` reaches the threshold `tau`. For `tau` ≤
-/// 0, returns infinity if `x` ≥ `tau`, and −infinity otherwise; all values that reach the threshold then tie.
+/// Returns the quotient `x`/`tau` of a normalized score and its threshold, by which Gaussians are ranked. It is at
+/// least 1 exactly if `x` reaches `tau`. For `tau` ≤ 0, returns a value that has the same meaning:
+/// - infinity if `x` ≥ `tau`, so that all values that reach the threshold tie;
+/// - −infinity otherwise.
 fn ratio(x: f64, tau: f64) -> f64 {
     if tau > 0.0 {
         x / tau

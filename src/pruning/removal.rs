@@ -11,8 +11,8 @@ use crate::passes::pixel_stride;
 use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// Number of rendered pixels of a view per Gaussian that is enough for a ranking by removal errors. More pixels change
-/// the ranking less than a different choice of views does.
+/// Number of rendered pixels of a view per Gaussian, for a ranking by removal errors (squared errors of renders caused
+/// by removing one Gaussian). More pixels change the ranking less than a different choice of views does.
 const PIXELS_PER_GAUSSIAN: f64 = 1.0;
 
 /// Returns the stride n for the renders by which `count` Gaussians are ranked: only every n-th column and row of pixels
@@ -22,12 +22,12 @@ pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
 }
 
 /// Renders only the Gaussians `ids` and returns for each of them the [`RemovalError`], the squared error that removing
-/// it would cause, summed over the views `pictures`. Only every `stride`-th column and row of pixels is rendered. For
-/// `contrast_floor` see [`RemovalError::contrast_floor`]. Calls `advance` after each view. The result does not depend
-/// on the number of threads. Fails if a frame cannot be read.
+/// it would cause, summed over the views `pictures`. Only every `stride`-th column and row of pixels is rendered. The
+/// square of `contrast_floor` is added to each squared color difference ([`RemovalError::contrast_floor`]). Calls
+/// `advance` after each view. The result does not depend on the number of threads. Fails if a frame cannot be read.
 ///
 /// Memory per Gaussian of `ids`, where d is the SH degree and a state has 44 + 12·(d + 1)² bytes:
-/// - its share of a reader of `source`;
+/// - the memory of the reader of `source`, per Gaussian;
 /// - its state at each frame of a batch; a batch has at most 4 × threads views, of at most [`Limits::frames_together`]
 ///   frames;
 /// - its state while its block of Gaussians is read;

@@ -35,7 +35,7 @@ pub const SCORING_BYTES_PER_GAUSSIAN: u64 =
     (StatisticRows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
 /// Returns the named parts of the memory per Gaussian, in bytes, that stay in use after scoring: the selection of
-/// Gaussians to keep, and the statistics unless these are in a scratch file.
+/// Gaussians to keep, and, if they are not in a scratch file, the statistics.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
     let rows = if limits.statistics_on_disk { 0 } else { StatisticRows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
@@ -57,8 +57,8 @@ pub struct ScoreStage {
     pub user: UserOverrides,
 }
 
-/// Minimum ratio of the number of frames to the median life span (number of frames in which a Gaussian is alive, by its
-/// opacity) at which life spans count as short. The user is then told about linking, which joins Gaussians that
+/// Ratio of the number of frames to the median life span (number of frames in which a Gaussian is alive, by its
+/// opacity) from which life spans count as short. The user is then told about linking, which joins Gaussians that
 /// continue one another in later frames.
 const SHORT_LIFE: usize = 4;
 
@@ -310,7 +310,7 @@ impl Scored {
         self.statistics.rows()
     }
 
-    /// Returns two statistics of every Gaussian: the contribution C, and the visibility Vis (share of the views in
+    /// Returns two statistics of every Gaussian: the contribution C, and the visibility Vis (fraction of the views in
     /// which the Gaussian is on screen).
     ///
     /// # Errors
@@ -351,10 +351,10 @@ impl Scored {
         self.terms.iter().map(summarize).collect()
     }
 
-    /// Writes three kinds of notes to `journal`: parts of scanning and scoring that the scene did not need, numbers of
-    /// Gaussians with unusual values, and advice if life spans are short. If the scan `is_partial`, terms of motion and
-    /// opacity are not mentioned, because they were not measured. `median_life`: median number of frames in which a
-    /// Gaussian is alive.
+    /// Writes three kinds of notes to `journal`, the record of the run: parts of scanning and scoring that the scene
+    /// did not need, numbers of Gaussians with unusual values, and advice if life spans are short. If the scan
+    /// `is_partial`, terms of motion and opacity are not mentioned, because they were not measured. `median_life`:
+    /// median number of frames in which a Gaussian is alive.
     fn record(&self, scene: &Scene, median_life: u32, is_partial: bool, journal: &mut Journal) {
         let info = scene.source().info();
         if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {

@@ -26,8 +26,8 @@ pub struct VisibilityStage {
     /// Parameters of the scan, of which this stage uses the strides of pixels, views and frames, and the maximum number
     /// of views.
     pub recipe: recipe::ScanParams,
-    /// Whether pruning rounds will rank the Gaussians again. Then it is enough to render every n-th column and row of
-    /// pixels, where n is [`ranking_stride`].
+    /// Whether pruning rounds will rank the Gaussians again. If so, this stage has to render only every n-th column and
+    /// row of pixels, where n is [`ranking_stride`].
     pub is_preliminary: bool,
 }
 

@@ -31,8 +31,8 @@ impl LinearizedState {
         LinearizedState { present: None, state: Gaussians::zeros(0, sh_degree), jacobian: Jacobian::default() }
     }
 
-    /// Returns the state of only the Gaussians whose indices are in `places`, which must be increasing. Gaussian
-    /// `places[i]` has the index i in the result.
+    /// Returns the state of only the Gaussians with the indices `places` in the model; `places` must be increasing. The
+    /// Gaussian with the index `places[i]` in this state has the index i in the result.
     pub(super) fn pick(&self, places: &[u32]) -> LinearizedState {
         let Some(present) = &self.present else { return self.rows(places, None) };
         let stays = |(to, place): (u32, &u32)| Some((present.binary_search(place).ok()? as u32, to));
@@ -40,7 +40,8 @@ impl LinearizedState {
         self.rows(&rows, Some(present))
     }
 
-    /// Returns a state that holds only the visible Gaussians, or `None` if they are too many for sparse storage.
+    /// Returns a copy with only the visible Gaussians, for sparse storage. Returns `None` if more than
+    /// 1/[`SPARSE_DIVISOR`] of the Gaussians are visible, or if this state already leaves out invisible Gaussians.
     fn to_sparse(&self) -> Option<LinearizedState> {
         let logits = self.state.opacity_logit.plane(0);
         let is_present = |&(_, &logit): &(u32, &f32)| logit >= ABSENT_LOGIT;
@@ -49,8 +50,9 @@ impl LinearizedState {
         is_sparse.then(|| self.rows(&present, Some(present.clone())))
     }
 
-    /// Returns a state with the values of only those Gaussians that are in the rows `rows` of this state. `present`:
-    /// index of each of these Gaussians in the model if the returned state leaves out invisible Gaussians, else `None`.
+    /// Returns a copy with only the Gaussians in the rows `rows` of this state. `present` becomes
+    /// [`LinearizedState::present`] of the copy: the index in the model of each Gaussian if invisible ones are left
+    /// out, otherwise `None`.
     fn rows(&self, rows: &[u32], present: Option<Vec<u32>>) -> LinearizedState {
         LinearizedState { present, state: self.state.pick(rows), jacobian: self.jacobian.pick(rows) }
     }
@@ -67,14 +69,15 @@ pub(super) struct LinearizedFrames {
     file: Spill,
     varying: Attributes,
     /// State of all Gaussians at the first frame. Attributes that do not vary with time have these values in all
-    /// frames. For attributes that vary, it gives the numbers of components and Gaussians of the other frames.
+    /// frames. Of attributes that vary, only the array size (number of components × number of Gaussians) holds for the
+    /// other frames.
     first: Option<LinearizedState>,
     frames: Vec<StoredFrame>,
 }
 
-/// Place of a frame in the scratch file: byte offset `at`, and, if the frame is stored without its invisible Gaussians,
-/// the number `present` of Gaussians that are stored. The indices of these Gaussians are written at `at`, then their
-/// values.
+/// Position of a frame in the scratch file. `at`: byte offset. `present`: number of stored Gaussians if invisible ones
+/// are left out, otherwise `None`. If Gaussians are left out, the indices of the stored ones are written at `at`, then
+/// their values.
 #[derive(Debug, Clone, Copy)]
 struct StoredFrame {
     at: u64,

@@ -35,9 +35,10 @@ pub(super) struct RenderQuality {
 }
 
 impl Loss {
-    /// Returns the derivative of the loss with respect to each color value of the render `picture`, multiplied by the
-    /// number of values and by a factor that is the same for all views. `target` has the values of the target view as
-    /// 16-bit integers. For values outside [0, 1] the derivative is 0, because a screen clamps these.
+    /// Returns the derivative of the loss with respect to each color value of the render `picture`, as an image.
+    /// Derivatives are multiplied by the number of color values and by a constant; Adam does not depend on a constant
+    /// factor. `target`: color values of the target view, 0 to 1 as 16-bit integers. For values of the render outside
+    /// [0, 1] the derivative is 0, because a screen clamps these.
     pub(super) fn slope(&self, picture: &Image, target: &[u16]) -> Image {
         let mut slope = picture.clone();
         for (value, &wanted) in slope.data.iter_mut().zip(target) {
@@ -70,15 +71,16 @@ impl Loss {
         [mean_square(picture, target), dissimilarity]
     }
 
-    /// Returns the bytes of memory, per pixel of a view, for comparing `threads` renders in parallel with their target
-    /// views. The renders and target views themselves are not included. Returns 0 if SSIM is not part of the loss.
+    /// Returns the bytes of memory, per pixel of a view, that buffers for SSIM take if `threads` renders are compared
+    /// with their target views in parallel. The renders and target views themselves are not included. Returns 0 if SSIM
+    /// is not part of the loss.
     pub(super) fn bytes_per_pixel(&self, threads: u64) -> u64 {
         let compared = threads * (12 + BYTES_PER_PIXEL) as u64;
         if self.ssim > 0.0 { compared.max((12 + SSIM_SLOPE_BYTES_PER_PIXEL) as u64) } else { 0 }
     }
 
-    /// Returns whether the quality `now` is better than `best`: its loss is lower, or, if SSIM is not part of the loss,
-    /// its mean PSNR is higher.
+    /// Returns whether the quality `now` is better than the quality `best`. If SSIM is part of the loss, the lower loss
+    /// is better; otherwise the higher mean PSNR is.
     pub(super) fn is_closer(&self, now: &RenderQuality, best: &RenderQuality) -> bool {
         let loss =
             |of: &RenderQuality| (1.0 - self.ssim) * SQUARED_WEIGHT * of.error.powi(2) + self.ssim * of.dissimilarity;
@@ -87,13 +89,14 @@ impl Loss {
 }
 
 impl RenderQuality {
-    /// Returns the root mean square error that corresponds to the mean PSNR: the geometric mean of the root mean square
-    /// errors of all views. A few views with large errors raise it less than they raise [`RenderQuality::error`].
+    /// Returns the geometric mean of the root mean square errors of all views, which is the error that corresponds to
+    /// the mean PSNR. A few views with large errors raise it less than they raise [`RenderQuality::error`].
     pub(super) fn typical_error(&self) -> f64 {
         10f64.powf(-self.psnr / 20.0)
     }
 
-    /// Returns the mean quality of several views. `pictures`: result of [`Loss::errors`] for each view.
+    /// Returns the mean quality of several views. `pictures` holds for each view two errors: the mean square error, and
+    /// 1 − SSIM (result of [`Loss::errors`]).
     pub(super) fn from_errors(pictures: &[[f64; 2]]) -> RenderQuality {
         let mean = |of: &dyn Fn(&[f64; 2]) -> f64| pictures.iter().map(of).sum::<f64>() / pictures.len().max(1) as f64;
         RenderQuality {

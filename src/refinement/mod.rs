@@ -82,8 +82,9 @@ pub struct RefineStage {
     pub pictures: usize,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub cuts: bool,
-    /// Minimum color difference (norm over red, green, blue, each from 0 to 1) that is assumed between a Gaussian and
-    /// the colors that it hides, when Gaussians are ranked for a prune step; see [`crate::render::RemovalError`].
+    /// Color difference (norm over red, green, blue, each from 0 to 1) whose square is added to the squared color
+    /// difference between a Gaussian and the colors that it hides, when Gaussians are ranked for a prune step; see
+    /// [`crate::render::RemovalError`].
     pub contrast_floor: f64,
     /// Maximum number of keyframes of the parameter delta that varies with time, for inputs with explicit frames. With
     /// 0, parameter deltas are constant in time.
@@ -144,9 +145,9 @@ impl RefineStage {
     }
 
     /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. `pixels`:
-    /// number of pixels of a view. `first`: number of Gaussians with which refinement begins. With prune steps, which
-    /// remove most Gaussians, the result is the [`RefineStage::stride`] for only a third of `first`. It may be larger
-    /// than the stride for `first`.
+    /// number of pixels of a view. `first`: number of Gaussians with which refinement begins. If prune steps remove
+    /// Gaussians, the stride is that for a third of `first`, which may be larger than that for `first`; see
+    /// [`RefineStage::stride`].
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
         let fewer = if self.cuts { first / 3 } else { first };
         self.stride(pixels, fewer)
@@ -176,9 +177,9 @@ impl RefineStage {
         }
     }
 
-    /// Returns the number of optimization steps before a prune step, if `left` Gaussians are left and `wanted` are to
-    /// remain in the end. With more Gaussians left there are fewer steps, because a step takes longer and more of its
-    /// effect is removed later.
+    /// Returns the number of optimization steps before a prune step: [`RefineStage::cut_steps`] · √(`wanted`/`left`).
+    /// `left`: number of Gaussians now. `wanted`: number of Gaussians after the last prune step. With more Gaussians
+    /// there are fewer steps, because a step takes longer and more of its effect is removed later.
     fn steps_before(&self, left: usize, wanted: usize) -> usize {
         (self.cut_steps as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
     }
@@ -279,16 +280,16 @@ impl RefineStage {
     }
 }
 
-/// Returns the number of Gaussians with which refinement begins, given that it ends with `wanted` of the `all`
-/// Gaussians of the model. This is at least the fraction `starts_at` of all; prune steps remove the surplus. If
+/// Returns the number of Gaussians with which refinement begins: `wanted`, the number with which it ends, or the
+/// fraction `starts_at` of the `all` Gaussians of the model, if that is more. Prune steps remove the surplus. If
 /// `starts_at` is `None`, there are no prune steps, and the result is `wanted`.
 pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }
 
 /// Returns the number of optimization steps of the time-varying delta (values that refinement adds to each frame): two
-/// thirds of `steps`. They are run after `steps` optimization steps of the constant delta (values that refinement adds
-/// to the stored parameters).
+/// thirds of `steps`, the number of steps of the constant delta (values that refinement adds to the stored parameters),
+/// which is optimized first.
 fn along_time(steps: usize) -> usize {
     2 * steps / 3
 }

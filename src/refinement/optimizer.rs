@@ -56,9 +56,9 @@ pub struct Adam {
     change: ParamDelta,
     /// Running mean of the derivatives, and running mean of the squared derivatives.
     means: [Gaussians; 2],
-    /// Two lists of factors on the learning rates, with one factor per Gaussian: the first list for positions (0.04
-    /// times the geometric mean of the scales of the Gaussian, scene units), the second for all other attributes (1).
-    /// Both factors are 0 for Gaussians that are not optimized.
+    /// Two lists of factors on the learning rates, with one factor per Gaussian. First list: for positions, 0.04 times
+    /// the geometric mean of the scales of the Gaussian, scene units. Second list: for all other attributes, 1. Both
+    /// factors are 0 for Gaussians that are not optimized.
     reach: [Vec<f32>; 2],
     columns: Attributes,
     done: usize,
@@ -103,8 +103,8 @@ impl Adam {
         moved
     }
 
-    /// Restarts the optimizer at the start parameters plus `change`, with running means of 0. Attributes without values
-    /// in `change` begin at the start parameters.
+    /// Restarts the optimizer: sets the current parameters to the start parameters plus `change`, and the running means
+    /// to 0. Attributes without values in `change` are set to the start parameters.
     pub fn restart(&mut self, change: &ParamDelta) {
         self.take_delta();
         for column in (self.columns & change.attributes()).iter() {
@@ -164,8 +164,8 @@ impl Adam {
     }
 }
 
-/// Returns the learning rate of component `c` of the attribute `column`. The rate of a position is a factor on
-/// `Adam::reach`, which depends on the size of the Gaussian.
+/// Returns the learning rate of component `c` of the attribute `column`. For positions it is 1, because their learning
+/// rate is given by `Adam::reach`, which depends on the size of the Gaussian.
 fn rate(column: Attributes, c: usize) -> f32 {
     match column {
         Attributes::POSITION => 1.0,

@@ -88,16 +88,15 @@ pub(super) struct OptimizerState<'a> {
     stride: NonZeroU32,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
-    /// Whether the frame states were evaluated again since `constant_optimizer` was created, at the beginning or in
-    /// the last prune step.
+    /// Whether the frame states were evaluated again after `constant_optimizer` was created. It is created at the
+    /// beginning and in every prune step.
     reevaluated: bool,
 }
 
-/// Contents of a checkpoint, in this order:
+/// Contents of a checkpoint of an [`OptimizerState`], in this order:
 /// - the stored parameters at the last evaluation of the frame states, and the delta that they include; `None` if the
-///   frame states were not evaluated again since the optimizer was created (at the beginning or in the last prune
-///   step),
-/// - delta, running means and step number of the optimizer,
+///   frame states were not evaluated again after `constant_optimizer` was created,
+/// - delta, running means and step number of `constant_optimizer`,
 /// - number of steps since the frame states were evaluated,
 /// - delta, running means and step number of the optimizer of each keyframe.
 type OptimizerCheckpoint<Stored, Added, Means> =
@@ -174,8 +173,8 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Replaces `constant_optimizer` by a new one, which has not changed anything yet, for the Gaussians in
-    /// `linearized`. Also sets the stride that suits the number of these Gaussians.
+    /// Replaces `constant_optimizer` by a new one, whose delta is 0, for the Gaussians in `linearized`. Also sets the
+    /// stride of the training views from the number of these Gaussians (see [`Loss::stride`]).
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -296,8 +295,8 @@ impl<'a> OptimizerState<'a> {
         moved.position
     }
 
-    /// Restarts the optimizer at the start parameters plus `change`, an earlier result of [`OptimizerState::change`]
-    /// with the same Gaussians.
+    /// Sets the stored parameters to the parameters at the start plus `change`, an earlier result of
+    /// [`OptimizerState::change`] with the same Gaussians, and restarts the optimizer there.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -441,7 +440,8 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Returns the squared error that removing each Gaussian would cause, summed over the target views with the indices
-    /// `views`. `contrast_floor`: see [`RemovalError::contrast_floor`].
+    /// `views`. The square of `contrast_floor` is added to each squared color difference
+    /// ([`RemovalError::contrast_floor`]).
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.

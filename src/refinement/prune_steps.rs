@@ -7,7 +7,8 @@ use crate::error::Result;
 use crate::journal::Journal;
 
 /// Models that a search for the smallest sufficient number of Gaussians has kept so far, each between two prune steps.
-/// To try another number of Gaussians, the search starts from the smallest of these models that is large enough.
+/// To try another number of Gaussians, the search starts from the smallest of these models that has at least this
+/// number.
 pub struct PrunedModels<'a> {
     refinement: RefineRun<'a>,
     /// Models between two prune steps, from the largest to the smallest. A model that already has the requested number
@@ -25,7 +26,8 @@ impl<'a> PrunedModels<'a> {
     /// Returns a refined model of `size` Gaussians. Prunes a larger model by optimization and prune steps, then runs
     /// the final optimization steps. Pruning begins with the smallest model stored by earlier calls that has at least
     /// `size` Gaussians. If there is none, or if `start` has at most `size` Gaussians, it begins with `start`: the
-    /// model of the Gaussians that ranking keeps, before any prune step. Notes for the user are added to `journal`.
+    /// model of the Gaussians that ranking keeps, before any prune step. Notes for the user are added to `journal`, the
+    /// record of the run.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.

@@ -199,7 +199,8 @@ struct BestState<Delta, Trajectory> {
     mean: MeanDelta<Delta>,
 }
 
-/// Mean of the parameter deltas after every [`AVERAGE_EVERY`]-th of the last optimization steps.
+/// Mean of the parameter deltas (values that refinement adds to the parameters) over the last optimization steps, of
+/// which every [`AVERAGE_EVERY`]-th counts.
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct MeanDelta<Delta> {
     delta: Delta,
@@ -381,8 +382,8 @@ impl<'a> RefineRun<'a> {
     }
 
     /// Writes a checkpoint of the current phase (one prune step with its optimization steps, or the final steps), after
-    /// `steps` optimization steps of this phase. Does nothing if too little time has passed since the last checkpoint,
-    /// or if the cache is disabled.
+    /// `steps` optimization steps of this phase. Does nothing if less time than `timer.interval` has passed since the
+    /// last checkpoint, or if the cache is disabled.
     fn save_checkpoint(
         &self,
         optimizer: &OptimizerState<'_>,
@@ -403,8 +404,9 @@ impl<'a> RefineRun<'a> {
         Ok(())
     }
 
-    /// Runs `steps` optimization steps, then keeps only the `size` Gaussians whose removal would cause the largest
-    /// squared error. Returns their indices.
+    /// Runs `steps` optimization steps, then removes all but `size` Gaussians from `optimizer`; mainly those stay whose
+    /// removal would cause the largest squared error (see [`survivors`]). Returns the indices of the Gaussians that
+    /// stay.
     fn prune_step(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -526,9 +528,12 @@ impl<'a> RefineRun<'a> {
 
     /// Runs the optimization steps of the time-varying delta, which follow the `steps` steps of the constant delta.
     /// Stores the best deltas in `best_state`. `done`: number of steps of both deltas in the loaded checkpoint; 0
-    /// without one. If `done` is above `steps`, continues from the checkpoint with the learning rates `schedule`;
-    /// otherwise starts from the best constant delta. Returns false if no attribute may vary with time or the constant
-    /// delta is good enough.
+    /// without a checkpoint.
+    /// - If `done` is above `steps`, continues from the checkpoint with the learning rates `schedule`.
+    /// - Otherwise starts from the best constant delta.
+    ///
+    /// Returns false if no step was run: no attribute may vary with time, or the PSNR is at least [`MAX_USEFUL_PSNR`]
+    /// already.
     fn refine_along_time(
         &mut self,
         optimizer: &mut OptimizerState<'_>,

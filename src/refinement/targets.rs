@@ -16,8 +16,8 @@ use crate::scene::views_outside::cameras_outside;
 
 /// Name of the cache entry of the target views.
 pub(crate) const NAME: &str = "targets";
-/// Shares of the target views, in 26ths: views from the scene's cameras, and views from new cameras (between two of the
-/// scene's cameras, or outside the rig).
+/// Numbers of target views by kind of camera, out of every 26. First: views from the scene's cameras. Second: views
+/// from new cameras, which are between two of the scene's cameras or outside the rig.
 const VIEW_SHARES: [usize; 2] = [3, 23];
 /// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
 /// exceed it.
@@ -46,7 +46,7 @@ pub(crate) struct ViewSplit {
 }
 
 /// Returns two numbers of target views: from the scene's cameras, and from new cameras. Their sum is at most
-/// `max_views`, and smaller if views of `pixels` pixels would need too many bytes.
+/// `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
     let count = (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize;
     VIEW_SHARES.map(|part| part * count / 26)
@@ -82,9 +82,9 @@ enum Purpose {
 }
 
 impl Targets {
-    /// Renders `max_views` views of the original; fewer if they would need too many bytes. Returns these target views.
-    /// Of training views only every `stride`-th column and row of pixels is rendered. If `has_test_views`, every fourth
-    /// view is a test view; otherwise there are no test views.
+    /// Renders at most `max_views` views of the original, fewer if they would exceed [`MAX_BYTES`], and stores them in
+    /// a scratch file. Returns these target views. Of training views only every `stride`-th column and row of pixels is
+    /// rendered. If `has_test_views`, every fourth view is a test view; otherwise there are no test views.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.

@@ -162,8 +162,8 @@ fn interrupted_runs_resume_to_the_same_result() {
     }
 }
 
-/// Demo scene in which each frame shows a third of the Gaussians. The third field is the opacity logit of the Gaussians
-/// that a frame does not show.
+/// Demo scene in which each frame shows a third of the Gaussians. Fields: the demo scene with all Gaussians visible,
+/// the description of this sequence, and the opacity logit of the Gaussians that a frame does not show.
 struct ShortLives(demo_scene::DemoScene, SequenceInfo, f32);
 
 struct Reader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, f32);

@@ -59,8 +59,8 @@ fn card(label: &str, before: &str, after: &str, more: &str) -> String {
     )
 }
 
-/// Returns the HTML of the four cards of a result: Gaussians, size, quality, and the comparison with photographs.
-/// Without photographs the last card has the render time; without render times, SSIM.
+/// Returns the HTML of the four cards of a result. The first three are Gaussians, size and quality. The fourth is the
+/// comparison with photographs if there are any, else the render time if it was measured, else SSIM.
 fn cards(result: &ResultData) -> String {
     let found = &result.evaluation;
     let (counts, sizes, mean) = (found.count, found.bytes, found.loss.overall);
@@ -117,8 +117,8 @@ fn milliseconds(value: f64) -> String {
 }
 
 /// Returns the parts of the size (such as Gaussians and deformation field) that both models have and that take more
-/// than 1% of the compressed model's bytes, as (name, bytes of the original, bytes of the compressed model). Returns an
-/// empty list if there are fewer than two such parts.
+/// than 1% of the compressed model's bytes. Each is a tuple: name, bytes of the original, bytes of the compressed
+/// model. Returns an empty list if there are fewer than two such parts.
 pub(super) fn size_parts(size: &OriginalAndCompressed<ModelSize>) -> Vec<(&'static str, u64, u64)> {
     let parts = size.original.named_parts().into_iter().zip(size.compressed.named_parts());
     let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();

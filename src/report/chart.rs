@@ -35,7 +35,7 @@ pub struct ChartAxis {
     pub label: String,
     /// Whether the axis is logarithmic. Values that are not positive are then left out.
     pub log: bool,
-    /// Whether the axis must reach 0.
+    /// Whether the axis must reach 0. Ignored if the axis is logarithmic.
     pub from_zero: bool,
 }
 
@@ -77,8 +77,8 @@ pub struct BarChart {
     pub label: String,
     /// Name and value of each bar, from top to bottom.
     pub bars: Vec<(String, f64)>,
-    /// Whether the axis covers only the range of the values instead of starting at 0. If so, marks are drawn instead of
-    /// bars.
+    /// Whether the axis covers only the range of the values. If so, each value is drawn as a mark. If not, the axis
+    /// starts at 0, and each value is drawn as a bar.
     pub is_fitted: bool,
 }
 
@@ -105,8 +105,8 @@ struct AxisScale {
 }
 
 impl AxisScale {
-    /// Returns a scale for the axis `axis` that covers `values` with a margin and runs from pixel `from` to pixel `to`
-    /// of the chart; `None` if there are no values to draw.
+    /// Returns a scale for the axis `axis` that covers the numbers in `values` with a margin. The axis runs from `from`
+    /// to `to`, positions in the chart in SVG units (about pixels). Returns `None` if there are no values to draw.
     fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =

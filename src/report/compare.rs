@@ -21,8 +21,8 @@ pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
            made brighter until it can be seen.</p>\n"
 }
 
-/// Returns the HTML of the sliders (two images of one view with a movable border) of all renders chosen for the page,
-/// except the render with the median PSNR and the worst one.
+/// Returns the HTML of the sliders of all renders chosen for the page, except the render with the median PSNR and the
+/// worst one. A slider shows two images of one view with a movable border between them.
 pub(super) fn other_sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
     let taken = [MEDIAN, WORST].map(|why| place_of(first, why));
@@ -42,7 +42,8 @@ fn place_of(shown: &[ShownImage], why: &str) -> Option<usize> {
     shown.iter().position(|shown| shown.choice.why.iter().any(|own| own == why))
 }
 
-/// Image of a slider (two images of one view with a movable border between them).
+/// One of the images of a slider. A slider shows two images of one view at a time, with a movable border between them;
+/// the user selects which two.
 struct Layer<'a> {
     name: String,
     uri: &'a str,
@@ -50,8 +51,9 @@ struct Layer<'a> {
     note: String,
 }
 
-/// Returns the images of one slider: original, compressed models, differences, and the photograph if there is one.
-/// `place` is the index of the render among those that the page shows. `names` has the names of the compressed models.
+/// Returns all images that the user can select in one slider: original, compressed models, differences, and the
+/// photograph if there is one. `place` is the index of the render among those that the page shows. `names` has the
+/// names of the compressed models.
 fn layers<'a>(results: &'a [Analysis], names: &[String], place: usize) -> Vec<Layer<'a>> {
     let image = |result: &'a Analysis, kind: &str| {
         let found = result.shown.get(place)?.images.iter().find(|image| image.0 == kind)?;
@@ -116,8 +118,8 @@ fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> 
     out + &format!("</div>\n<p class=\"caption\">{}{shrunk}</p>\n</figure>\n", scores(shown))
 }
 
-/// Returns a remark on the resolution of shown images: each shown pixel stands for `shrunk` × `shrunk` pixels of the
-/// render. Empty if `shrunk` is 1.
+/// Returns a remark for the reader of the page that shown images have fewer pixels than the render: each shown pixel
+/// stands for `shrunk` × `shrunk` pixels. Empty if `shrunk` is 1.
 fn at_size(shrunk: u32) -> String {
     match shrunk {
         1 => String::new(),

@@ -133,12 +133,12 @@ fn numbers(result: &ResultData, name: &str) -> String {
     out
 }
 
-/// Quality measure: its name, the function that returns its mean, the function that formats it, and whether larger
-/// values are better.
+/// Quality measure, such as PSNR. The fields are, in order: its name, the function that returns its mean, the function
+/// that formats a value, and whether larger values are better.
 type Measure = (&'static str, fn(&QualityMeans) -> Option<f64>, fn(f64) -> String, bool);
 
-/// Returns HTML table rows, one per quality measure of the comparison `of`, with its average, its worst frame and its
-/// worst view. `name` says what is compared.
+/// Returns HTML table rows, one per quality measure, with the average, the worst frame and the worst view of the
+/// comparison `of`. `name` says what is compared, such as "compressed to original".
 fn measures(name: &str, of: &Comparison) -> String {
     const MEASURES: [Measure; 4] = [
         ("PSNR", |means| Some(means.psnr), db, true),

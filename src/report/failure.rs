@@ -1,4 +1,4 @@
-//! Failure modes (kinds of damage that the paper names), detected in renders.
+//! Detection of failure modes in renders. A failure mode is visible damage by compression to one kind of Gaussian.
 //!
 //! Input: the kinds of every Gaussian ([`mod@super::gaussian_kinds`]: fast, thin or changing in appearance) and the
 //! renders of both models. Output, for each kind: the error where the kind is visible, the error elsewhere, the worst
@@ -19,12 +19,12 @@ use crate::render::{Image, render};
 /// PSNR in dB below which an error counts as visible: at 40 dB the root mean square error is 1/100 of the range of
 /// colors.
 pub const VISIBLE_ERROR_PSNR_DB: f64 = 40.0;
-/// Minimum gap in dB for a failure mode to be flagged: PSNR where the kind of Gaussian is not visible, minus PSNR where
-/// it is visible. A PSNR lower by 3 dB means twice the squared error.
+/// Minimum difference in dB for a failure mode to be flagged: PSNR where its kind of Gaussian is not visible, minus
+/// PSNR where it is visible. A PSNR lower by 3 dB means twice the squared error.
 pub const MIN_PSNR_GAP_DB: f64 = 3.0;
-/// Minimum share of a kind of Gaussian in a render: Σ alpha · transmittance of the Gaussians of this kind in a pixel,
-/// averaged over the pixels of the render, from 0 to 1. Renders with a smaller share are ignored in the search for the
-/// worst damage to this kind. If all renders are ignored, the damage is not judged.
+/// Minimum share of a kind of Gaussian in a render, from 0 to 1. The share in a pixel is Σ alpha · transmittance of the
+/// Gaussians of this kind; the share in a render is the mean over its pixels. Renders with a smaller share are ignored
+/// in the search for the worst damage to this kind. If all renders are ignored, the damage is not judged.
 pub const MIN_PIXEL_SHARE: f64 = 1e-3;
 /// Minimum lost fraction of the contribution of a kind of Gaussian to renders. The contribution of the Gaussians of
 /// this kind that were dropped or merged counts as lost. If the lost fraction is smaller, damage to this kind (its
@@ -33,8 +33,8 @@ pub const MIN_LOST_SHARE: f64 = 0.01;
 /// Side length in pixels of the square that is shown where a failure mode is worst.
 pub const CROP_SIDE_PX: u32 = 64;
 
-/// Error between the renders of both models in one view, summed over its pixels, in total and for each kind of
-/// Gaussian.
+/// Squared error between the renders of both models in one view, summed over its pixels: in total, and for each kind of
+/// Gaussian (fast, thin or changing in appearance).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewErrorSums {
     /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`].
@@ -62,13 +62,16 @@ struct FailureSums {
 pub enum Verdict {
     /// Verdict if the scene has no Gaussian of the kind that the failure mode concerns.
     Absent,
-    /// Verdict if the scene has Gaussians of the kind, but their share of every render is too small to be judged.
+    /// Verdict if the scene has Gaussians of the kind, but their share of every render is below [`MIN_PIXEL_SHARE`].
     Unseen,
-    /// Verdict if almost no Gaussian of the kind was dropped or merged, measured by their contribution to renders.
+    /// Verdict if compression dropped or merged almost no Gaussian of the kind: those that it did drop or merge make up
+    /// less than the fraction [`MIN_LOST_SHARE`] of the kind's contribution to renders.
     Untouched,
-    /// Verdict if the error where Gaussians of the kind are visible is imperceptible or not much larger than elsewhere.
+    /// Verdict if damage to the kind is not visible. Where the kind is visible, PSNR is at least
+    /// [`VISIBLE_ERROR_PSNR_DB`], or it is lower than elsewhere by less than [`MIN_PSNR_GAP_DB`].
     Passed,
-    /// Verdict if the error where Gaussians of the kind are visible is perceptible and much larger than elsewhere.
+    /// Verdict if damage to the kind is visible. Where the kind is visible, PSNR is below [`VISIBLE_ERROR_PSNR_DB`],
+    /// and it is lower than elsewhere by at least [`MIN_PSNR_GAP_DB`].
     Flagged,
 }
 
@@ -109,7 +112,8 @@ pub struct FailureMode {
     /// Fraction of this kind's contribution to renders that belongs to Gaussians that were dropped or merged; `None`
     /// without an index map (file that maps input to output Gaussians).
     pub coverage_lost: Option<f64>,
-    /// Share of this kind of Gaussian in all pixels of all compared renders, from 0 to 1.
+    /// Mean share of this kind of Gaussian in a pixel (Σ alpha · transmittance of its Gaussians), over all pixels of
+    /// all compared renders, from 0 to 1.
     #[serde(rename = "shown")]
     pub pixel_share: f64,
     /// PSNR where this kind of Gaussian is visible, with each pixel weighted by the share of the kind, dB; `None` if
@@ -141,8 +145,8 @@ pub struct KindTotals {
     pub shares: (f64, f64),
 }
 
-/// Renders the Gaussians `state` with colors that encode their kinds (`traits`), and returns the image: red, green and
-/// blue of a pixel are the shares of the three kinds in it.
+/// Renders the Gaussians `state` with colors that encode their kinds (`traits`), and returns the image. Red, green and
+/// blue of a pixel are the shares (Σ alpha · transmittance) of the three kinds in it.
 pub fn render_kind_shares(state: &Gaussians, traits: &[KindFlags], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
@@ -296,11 +300,12 @@ fn db(error: f64, weight: f64) -> Option<f64> {
     (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
 }
 
-/// Returns the upper left corner of the square in which the error of one kind of Gaussian is largest. `taken` has the
-/// renders of both models, and `shares` the shares of the kinds in every pixel. The error is the sum of w e² over the
-/// pixels of the square, where w is the share of the kind in a pixel and e² the squared difference of the renders. The
-/// square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal squares the first is taken, row
-/// by row.
+/// Returns the upper left corner of the square of a render in which the error of one kind of Gaussian is largest.
+/// `taken` has the renders of both models, and `shares` the shares w of the kinds in every pixel.
+///
+/// - The error of a square is the sum of w e² over its pixels, where e² is the squared difference of the renders.
+/// - A square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render.
+/// - Of equal squares, the first is taken, row by row.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP_SIDE_PX as usize).min(width), (CROP_SIDE_PX as usize).min(height));

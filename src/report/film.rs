@@ -41,7 +41,8 @@ pub struct FilmPanel {
     pub why: Vec<String>,
     /// Number of the animated view.
     pub view: u32,
-    /// Index of the frame whose camera is used for all frames, if the camera of the view moves.
+    /// Index of the frame from which the camera of the animation is taken. All frames are rendered from this camera,
+    /// even if the camera of the view moves.
     pub camera_of_frame: usize,
     /// Numbers of the frames that the animation shows, in order.
     pub frames: Vec<usize>,

@@ -37,7 +37,8 @@ pub struct ReportData {
 /// Data of one compressed model in a report.
 #[derive(Debug, Serialize)]
 pub struct ResultData {
-    /// Verdict in two or three sentences: size, visibility of the loss, and failure modes.
+    /// Verdict in two or three sentences: size of the model, how visible its differences from the original are, and
+    /// failure modes.
     pub verdict: String,
     /// Comparison with the original: mean scores over all renders, by view and by frame.
     pub evaluation: Evaluation,
@@ -46,16 +47,16 @@ pub struct ResultData {
     /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,
-    /// Measurements of the failure modes, one per kind of Gaussian (fast, thin, …) in the order of
-    /// [`super::gaussian_kinds::GaussianKind::ALL`]. They tell whether the loss is visible where Gaussians of this kind
-    /// are visible.
+    /// Measurements of the failure modes (damage to one kind of Gaussian, such as fast or thin ones), in the order of
+    /// [`super::gaussian_kinds::GaussianKind::ALL`]. Each states whether renders differ more where this kind is
+    /// visible.
     pub failure_modes: Vec<FailureMode>,
     /// Histograms of the scores of kept, merged and dropped Gaussians; `None` without an index map (file that maps
     /// input to output Gaussians).
     pub histograms: Option<Vec<Histogram>>,
     /// Content of the file `summary.json` of the run that wrote the compressed model, if it was found.
     pub run: Option<serde_json::Value>,
-    /// Texts about files that were not found beside the compressed model: name and reason.
+    /// One text for each file that was not found beside the compressed model: its name, and the reason.
     pub missing: Vec<String>,
     /// Notes for the user.
     pub notes: Vec<String>,

@@ -1,4 +1,4 @@
-//! Kinds of Gaussian that compression is known to hurt: fast, thin, or changing in appearance.
+//! Kinds of Gaussian that compression is known to damage: fast, thin, or changing in appearance.
 //!
 //! Input: the original's frames and statistics. Output: the [`KindFlags`] (membership in each kind) of every Gaussian.
 //! The kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5.
@@ -17,23 +17,26 @@ use crate::passes::{FrameReaders, gather};
 use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Minimum trajectory magnitude D of a fast Gaussian, as a fraction of the scene extent per frame. It is one pixel per
-/// frame in a render that shows the scene over 500 pixels.
+/// Minimum trajectory magnitude D (root mean square step from frame to frame) of a fast Gaussian, as a fraction of the
+/// scene extent. It is one pixel per frame in a render that shows the scene over 500 pixels.
 pub const MIN_FAST_MOTION: f64 = 2e-3;
-/// Minimum relative change over time of the distances between a Gaussian and its neighbors that counts as non-rigid
-/// motion. The change is a root mean square over time, and at least half of the neighbors must reach it.
+/// Minimum change of the distances between a Gaussian and its neighbors that counts as non-rigid motion. For one
+/// neighbor, the change is relative to the distance, as root mean square over time. The lower median over the neighbors
+/// must reach this value.
 pub const MIN_NON_RIGID_CHANGE: f64 = 0.05;
-/// Minimum divisor for relative changes of the distance between two neighbors, as a fraction of the scene extent.
-/// Without it, small motions of very close neighbors, which are invisible, would give large relative changes.
+/// Minimum distance by which the change of a distance between two neighbors is divided to get the relative change, as a
+/// fraction of the scene extent. Without this minimum, invisible small motions of very close neighbors would give large
+/// relative changes.
 const NEAREST: f64 = 1e-3;
 /// Number of nearest neighbors of a Gaussian to which distances are measured over time.
 pub const NEIGHBORS: usize = 8;
 /// Minimum ratio of the largest to the middle scale of a thin Gaussian.
 pub const MIN_THIN_RATIO: f64 = 5.0;
-/// Maximum trajectory magnitude D of a still Gaussian, as a fraction of the scene extent per frame.
+/// Maximum trajectory magnitude D (root mean square step from frame to frame) of a still Gaussian, as a fraction of the
+/// scene extent.
 pub const MAX_STILL_MOTION: f64 = 5e-4;
 /// Minimum change of opacity that counts as a change of appearance: standard deviation over the frames in which the
-/// Gaussian is alive.
+/// Gaussian is alive (opacity ≥ alpha_min).
 pub const MIN_OPACITY_CHANGE: f64 = 0.05;
 /// Minimum change of the base color that counts as a change of appearance: standard deviation over the frames in which
 /// the Gaussian is alive (opacity ≥ alpha_min), root mean square over the channels, colors in [0, 1]. It is five steps
@@ -78,7 +81,8 @@ pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
 pub type KindFlags = [bool; 3];
 
 /// Returns for every Gaussian the [`GaussianKind`]s to which it belongs, as one flag per kind. A Gaussian that is never
-/// visible belongs to none.
+/// visible belongs to none. `scored` has the statistics of the Gaussians. A Gaussian counts as alive at opacities of at
+/// least `alpha_min`.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -141,11 +145,14 @@ fn samples(frames: usize) -> Vec<usize> {
     (0..count).map(|k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) }).collect()
 }
 
-/// Measures how non-rigidly each of the Gaussians `ids` and its neighbors move. The neighbors are the nearest visible
-/// Gaussians at the reference frame. For each neighbor, the change of its distance over time (root mean square) is
-/// divided by the distance at the reference frame or by `nearest`, whichever is larger. Returns for each Gaussian the
-/// lower median of these relative changes over its neighbors. `frames` are the frames at which distances are measured.
-/// A rigid motion, rotations included, gives 0. The median ignores neighbors that belong to another object.
+/// Returns for each of the Gaussians `ids` how much it moves relative to its neighbors, as one number. A rigid motion,
+/// rotations included, gives 0.
+///
+/// - The neighbors are the nearest visible Gaussians at the reference frame.
+/// - For each neighbor, the root mean square change of its distance over the frames `frames` is divided by the distance
+///   at the reference frame or by `nearest`, whichever is larger.
+/// - The result is the lower median of these relative changes over the neighbors. It ignores neighbors that belong to
+///   another object.
 fn non_rigid_motion(
     source: &dyn FrameSource,
     reference: &Gaussians,

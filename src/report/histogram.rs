@@ -48,8 +48,8 @@ pub struct Histogram {
     pub name: &'static str,
     /// Meaning of the score or statistic, with its unit.
     pub meaning: &'static str,
-    /// Whether all bins have the same ratio of upper to lower edge. Otherwise all bins have the same width, from 0 to
-    /// 1.
+    /// Whether the bins are logarithmic: all bins have the same ratio of upper to lower edge. Bins that are not
+    /// logarithmic have the same width and cover 0 to 1.
     pub log: bool,
     /// Edges of the bins in increasing order, one more than there are bins; empty if no value is positive.
     pub edges: Vec<f64>,

@@ -2,9 +2,13 @@
 //!
 //! Input: the original, one or more compressed models, their cameras, and the files that `compress` wrote beside its
 //! results. Output: a folder with `report.html`, which needs nothing but a browser, and all its data as JSON and CSV.
-//! The steps are `run` (files of `compress`), `gaussian_kinds` (Gaussians at risk), the evaluation observed by
-//! `failure`, `histogram`, `shown_images` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`,
-//! `details`.
+//!
+//! Steps and their modules:
+//! - `run` reads the files of `compress`.
+//! - `gaussian_kinds` finds the Gaussians at risk.
+//! - `failure` looks at every render of the evaluation for damage to these Gaussians.
+//! - `histogram`, `shown_images` and `film` make histograms, images and animations.
+//! - `page` writes the page, with `cards`, `compare`, `quality` and `details`.
 //!
 //! Memory: the memory of an evaluation or of scoring, which run one after the other, and the page.
 
@@ -91,8 +95,8 @@ pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
     Completion::from_result(report_whole(options))
 }
 
-/// Runs [`report`] and returns its data. A run that computes only one shard (part of a divided stage) ends with the
-/// error [`Error::ShardDone`].
+/// Does the work of [`report`], and returns the data of the report. A run that computes only one shard (part of a
+/// divided stage) ends with the error [`Error::ShardDone`].
 ///
 /// # Errors
 /// Fails as [`report`] does.
@@ -132,8 +136,9 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     Ok(report)
 }
 
-/// Compares the compressed model that `options` name with the original. `wanted` lists the renders that the page will
-/// show; if it is `None`, this function chooses them. `render_time` requests that render times are measured.
+/// Compares the compressed model that `options` name with the original, and returns everything that the page shows of
+/// it. `wanted` lists the renders to show; if it is `None`, this function chooses them. `render_time` states whether to
+/// measure render times.
 fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
     let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
@@ -243,10 +248,11 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     Ok(recipe)
 }
 
-/// Returns the views by which the run that wrote the compressed model scored Gaussians. They are recognized by their
-/// number, which the summary of the run states. Tried in this order: the training views, all views, the held-out views.
-/// Without a summary, or if none of these has the stated number of views, returns the training views, or all views if
-/// there are no training views.
+/// Returns the views by which the run that wrote the compressed model scored Gaussians. The summary of the run states
+/// only their number, so they are recognized by it:
+/// - Returns the first of these sets that has the stated number of views: training views, all views, held-out views.
+/// - If no set has this number, or if there is no summary, returns the training views, or all views if there are no
+///   training views.
 fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
@@ -282,9 +288,10 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     ))
 }
 
-/// Returns for each kind of Gaussian the counts and the contribution of its Gaussians, from their statistics `rows`.
-/// `traits` has the kinds of every Gaussian. `fates` is `None` without an index map (file that maps input to output
-/// Gaussians).
+/// Returns for each of the three kinds of Gaussian (moving, thin, changing in appearance; [`GaussianKind`]) the number
+/// of its Gaussians, how many of them were dropped and merged, and their shares of the contribution, from the
+/// statistics `rows`. `traits` states of which kinds every Gaussian is. `fates` has the fate of every Gaussian (kept,
+/// merged or dropped); it is `None` without an index map (file that maps input to output Gaussians).
 fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindTotals; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
@@ -298,9 +305,9 @@ fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -
     })
 }
 
-/// Renders again the views of `choices`, and the view in which each failure mode of `modes` is worst. Returns the
-/// images of `choices`, and for each failure mode the images of its worst place. Failure modes without a worst place
-/// have no images. `traits` has the kinds of every Gaussian.
+/// Renders again the views of `choices`, and the view in which each failure mode of `modes` is worst. Returns two
+/// lists: the images of each of `choices`, and the images of the worst place of each failure mode. Failure modes
+/// without a worst place are left out. `traits` has the kinds of every Gaussian.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],

@@ -38,7 +38,7 @@ pub struct RunFiles {
     pub recipe: Option<Recipe>,
     /// Fate of every Gaussian of the original (kept, merged or dropped), from the index map.
     pub fates: Option<Vec<Fate>>,
-    /// Texts about files that were not used: name and reason.
+    /// One text for each file that was not used: its name, and the reason.
     pub missing: Vec<String>,
 }
 

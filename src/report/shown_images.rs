@@ -27,7 +27,7 @@ pub const MAX_RENDERS_PER_PAGE: usize = 4;
 /// Maximum number of pixels of a shown image; larger renders are scaled down. Images of trained scenes take about 2
 /// bytes per pixel in base64.
 pub const MAX_PIXELS: u64 = 160_000;
-/// Minimum fraction of the values of a brightened difference image that must not exceed 1.
+/// Fraction of the values of a difference image that must stay at or below 1 when the image is brightened.
 const UNCLIPPED: f64 = 0.999;
 /// Maximum factor by which difference images are brightened. At 64, a difference of 1/255 becomes a quarter of the
 /// range.

@@ -1,5 +1,5 @@
-//! Curves of a sweep (measurements of several methods at several sizes): quality against Gaussians, bytes, time and
-//! memory.
+//! Charts and page of a sweep, which measures several methods at several sizes: quality against number of Gaussians,
+//! bytes, time and memory.
 //!
 //! Input: a [`TradeOff`]. Output: charts as SVG, whose colors come from [`super::chart::STYLE`], and pages with charts.
 
@@ -16,7 +16,7 @@ pub const PAGE_FILE: &str = "sweep.html";
 /// Chart: its caption, and its `<svg>` element.
 pub type Chart = (String, String);
 
-/// Function that returns one coordinate of a measurement in a chart; `None` if it is not known.
+/// Function that returns the x or the y coordinate of a measurement in a chart; `None` if it is not known.
 type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 
 /// Returns the HTML of the page that the command `sweep` writes.

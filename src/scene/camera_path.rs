@@ -3,10 +3,10 @@
 use super::views_between::{interpolated_camera, meeting_point};
 use crate::model::Camera;
 
-/// Returns `count` cameras on the path through the cameras `stops`, in order, from the first to the last. Between two
-/// stops, rotation, distance from the point where the optical axes meet, focal length and principal point are
-/// interpolated evenly. The steps from camera to camera are equally long. If all stops are at one position, there are
-/// equally many steps between any two successive stops. All images have the size of the first stop's image.
+/// Returns `count` cameras on a path from the first to the last of the cameras `stops`, through all of them in order.
+/// Between two stops, rotation, distance from the point where the optical axes meet, focal length and principal point
+/// are interpolated evenly. The steps from camera to camera are equally long. If all stops are at one position, there
+/// are equally many steps between any two successive stops. All images have the size of the first stop's image.
 pub fn cameras_along(stops: &[Camera], count: usize) -> Vec<Camera> {
     let (Some(first), Some(last)) = (stops.first(), stops.last()) else { return Vec::new() };
     let focus = meeting_point(stops);

@@ -22,9 +22,10 @@ pub struct InputOptions {
     pub iteration: Option<u32>,
     /// Conventions of the training, such as the period of colors, that the files of some model formats do not state.
     pub conventions: TrainingConventions,
-    /// Whether a folder with one PLY file per frame may lack frames.
+    /// Whether a folder with one PLY file per frame may lack the files of some frames.
     pub allow_gaps: bool,
-    /// Choice whether the Gaussians of successive frames are matched with each other and linked into tracks.
+    /// Whether Gaussians of successive frames are matched, so that each Gaussian is followed through the frames as a
+    /// track.
     pub link: LinkMode,
     /// Number of frames at which a model that is continuous in time is evaluated; `None`: the times of the cameras are
     /// used.
@@ -40,7 +41,7 @@ pub struct InputOptions {
     /// Folder for temporary files during the run: the packed frames of a stream, and data that does not fit into
     /// `memory`; `None`: the system's folder for temporary files.
     pub scratch: Option<PathBuf>,
-    /// Whether the user named the folder `scratch`; otherwise it was derived from the path of the output.
+    /// Whether the user chose the folder `scratch`. If not, it was derived from the path of the output.
     pub is_scratch_named: bool,
     /// Memory that the run may take.
     pub memory: Budget,

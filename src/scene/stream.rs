@@ -42,8 +42,9 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
-/// Opens the stream on standard input together with its cameras. The Gaussians of its frames are linked into tracks if
-/// [`is_linked`] says so; otherwise the frames are packed into a temporary container.
+/// Opens the stream on standard input together with its cameras. The Gaussians of its frames are linked into tracks
+/// (Gaussians followed through frames) if [`is_linked`] says so; otherwise the frames are packed into a temporary
+/// container.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
@@ -68,14 +69,14 @@ fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Rec
     ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
 }
 
-/// Returns whether Gaussians of successive frames are linked into tracks: if the frames share no Gaussian ids, or if
-/// the user asks for it.
+/// Returns whether Gaussians of successive frames are linked into tracks (Gaussians followed through frames): if the
+/// frames share no Gaussian ids, or if the user asks for it.
 pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
     header.is_unlinked || options.link.links_frames_always()
 }
 
-/// Receives a stream of frames and links their Gaussians into tracks. Only for streams for which [`is_linked`] returns
-/// true.
+/// Receives a stream of frames and links their Gaussians into tracks (Gaussians followed through frames). Only for
+/// streams for which [`is_linked`] returns true.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
@@ -97,8 +98,8 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
     Ok(OpenedInput { input: Box::new(input), rig, notes })
 }
 
-/// Creates a quota for the frames of a stream. It counts arriving frames and knows how many can be packed within the
-/// memory budget.
+/// Returns the quota for the frames of a stream with the header `header`: a counter of arriving frames that fails as
+/// soon as there are more than can be packed within the memory budget.
 ///
 /// # Errors
 /// Fails if the memory budget is too small for one block of frames (the frames in a tile of the container).
@@ -116,8 +117,8 @@ pub fn frame_quota(options: &InputOptions, header: &StreamHeader) -> Result<Fram
     }))
 }
 
-/// Maximum number of frames of a stream within the memory budget, and the number that has arrived. How many frames a
-/// stream has is unknown until its end.
+/// Counter of the frames of a stream that have arrived, with their maximum number within the memory budget. It is
+/// needed because the length of a stream is unknown until its end.
 #[derive(Debug)]
 pub struct FrameQuota {
     /// Number of frames that have arrived so far.
@@ -130,8 +131,8 @@ pub struct FrameQuota {
 }
 
 impl FrameQuota {
-    /// Creates a quota for `budget`: finds the maximum number of frames that fit. `peak(limit, frames)` returns the
-    /// memory in bytes that a run with a budget of `limit` bytes takes for a stream of `frames` frames.
+    /// Creates a quota for `budget`, and finds the maximum number of frames that fit. `peak(limit, frames)` returns the
+    /// memory in bytes that a run takes for a stream of `frames` frames if its budget is `limit` bytes.
     pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> FrameQuota {
         let bytes = budget.limit();
         // Finds the number bit by bit; a stream has fewer than 2^32 frames.
@@ -170,8 +171,10 @@ impl FrameQuota {
 const PER_FRAME: u64 = 2 * (8 + 4);
 
 /// Estimates the memory of packing a stream of `frames` frames, of which `held` are in memory at a time. `measuring`
-/// tells what else is done as frames arrive: nothing (`None`), statistics (`Some(false)`), or statistics and renders of
-/// views (`Some(true)`).
+/// tells what else is done as frames arrive:
+/// - `None`: nothing.
+/// - `Some(false)`: statistics.
+/// - `Some(true)`: statistics, and renders of views.
 pub fn receiving_estimate(
     work: &Workload,
     limits: &Limits,

@@ -10,8 +10,8 @@ use crate::render;
 /// Selection among the views of a camera rig.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ViewSet {
-    /// Held-out views, which were not used for training: the test views, else the validation views. All views if the
-    /// cameras hold out none.
+    /// Views that were not used for training: the test views if there are any, else the validation views, else all
+    /// views.
     #[default]
     HeldOut,
     /// Views of one split (training, validation or test), of which there must be at least one.
@@ -78,9 +78,9 @@ pub fn select_view(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, 
     })
 }
 
-/// Returns those of the views `pictures` that belong to at most `count` different frames (to one frame if `count` is
-/// 0). The frames are evenly spaced and include the first and the last. Of K frames, this function keeps those with the
-/// indices round(i·(K − 1)/(count − 1)), halves to even, as numpy's `round(linspace(0, K − 1, count))` does.
+/// Returns the views in `pictures` at `count` evenly spaced frames, which include the first and the last. Returns all
+/// views if they have at most `count` frames; a `count` of 0 counts as 1. Of K frames, those with the indices
+/// round(i·(K − 1)/(count − 1)), halves to even, are chosen, as by numpy's `round(linspace(0, K − 1, count))`.
 pub fn select_frames(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
     let count = count.max(1);
     let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
@@ -97,10 +97,9 @@ pub fn select_frames(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
 /// Returns at most `most` of the views `pictures`, spread evenly over frames and view numbers. `pictures` must be
 /// sorted by frame, then view.
 ///
-/// The views are picked at equal distances from a list of all views, which is ordered by frame. Before that, the views
-/// of each frame are shifted cyclically among themselves. For the n-th frame, the shift is the fractional part of n
-/// times the golden ratio, as a fraction of the number of its views. Without the shift, the same view numbers would be
-/// picked again and again.
+/// The views are picked at equal distances from a list of all views, ordered by frame. In this list, the views of the
+/// n-th frame are shifted cyclically among themselves, by this fraction of their number: the fractional part of n times
+/// the golden ratio. Without the shift, the same view numbers would be picked again and again.
 pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
     let (count, most) = (pictures.len(), most.max(1));
     if count <= most {

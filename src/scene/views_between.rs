@@ -13,13 +13,15 @@ const MIN_FRACTION: f64 = 0.15;
 /// direction would be undefined.
 const MIN_COSINE: f64 = -0.6;
 
-/// Returns `count` new cameras, each at a random place on the path between two of `cameras`. Along the path, rotation
-/// and distance from the point where the optical axes meet are interpolated evenly. Returns no camera if all cameras
-/// are at one position. The random numbers are the same in every run.
+/// Returns `count` new cameras, each at a random place on a path between two of `cameras`. Along a path, rotation and
+/// distance from the point where the optical axes meet are interpolated evenly. Returns no camera if all cameras are at
+/// one position. The random numbers are the same in every run.
 ///
-/// The camera at the start of a path is chosen at random. The camera at its end is chosen at random among the cameras
-/// that are less than about 127° away, as seen from the point where the optical axes meet. If there are none, the
-/// nearest camera at another position is taken. (Paths between neighbors only would leave the middle of a rig empty.)
+/// - The camera at the start of a path is chosen at random.
+/// - The camera at its end is chosen at random among the cameras that are less than about 127° away, as seen from the
+///   point where the optical axes meet. If there are none, the nearest camera at another position is taken.
+///
+/// Paths between neighbors only would leave the middle of a rig empty.
 pub fn cameras_between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
     let mut random = SplitMix64(0);
@@ -39,9 +41,9 @@ pub fn cameras_between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     found
 }
 
-/// Returns the camera at the fraction `fraction` (0 to 1) of the path from the camera `from` to the camera `to`. Its
-/// rotation and its distance from `focus`, the point where the optical axes meet, are interpolated evenly. So is the
-/// direction in which the camera sees `focus`.
+/// Returns the camera at the fraction `fraction` (0 to 1) of the path from the camera `from` to the camera `to`.
+/// `focus` is the point where the optical axes meet. The rotation, the distance from `focus`, and the direction in
+/// which the camera sees `focus` are interpolated evenly.
 pub(super) fn interpolated_camera(from: &Camera, to: &Camera, fraction: f64, focus: DVec3) -> Camera {
     let [a, b] = [from, to].map(|camera| DQuat::from_mat3(&camera.rotation));
     let rotated = DMat3::from_quat(a.slerp(b, fraction));

@@ -1,5 +1,5 @@
-//! Cameras outside the rig (the cameras of a scene): they see the scene from directions that neither a camera of the
-//! rig nor a camera on a path between two of them has. In a player or in VR, people move to such places.
+//! Cameras outside the rig (the cameras of a scene). They see the scene from new directions: no camera of the rig, and
+//! no camera on a path between two of them, sees it from there. In a player or in VR, people move to such places.
 
 use std::collections::BTreeSet;
 use std::f64::consts::PI;
@@ -26,12 +26,13 @@ const TRIES: usize = 64;
 /// ([`RigCone::angle`]).
 const MAX_DIRECTIONS: usize = 64;
 /// Tolerance of the search for the direction of a cone that is nearest to a given direction ([`RigCone::angle`]). It is
-/// used in two tests. The search ends if no direction of the cone has a dot product above this value with the remainder
-/// (the given direction minus the nearest point of the cone found so far). Vectors count as linearly dependent if the
-/// absolute value of their determinant is at most this value.
+/// used in two tests. The remainder is the given direction minus the nearest point of the cone found so far.
+/// - The search ends if no direction of the cone has a dot product with the remainder above this value.
+/// - Vectors count as linearly dependent if the absolute value of their determinant is at most this value.
 const EXACT_ENOUGH: f64 = 1e-12;
-/// Tolerance for the faces of a cone: sine of the angle below which a direction counts as being on a face, and distance
-/// of unit normals up to which two faces count as the same.
+/// Tolerance for the faces of a cone, with two uses:
+/// - A direction is on a face if the sine of its angle to the face is below this value.
+/// - Two faces are the same if their unit normals are at most this distance apart.
 const FLAT: f64 = 1e-6;
 
 /// Directions from which the cameras of a rig see the scene: the convex cone of the directions from the point where
@@ -42,8 +43,9 @@ pub struct RigCone {
 }
 
 impl RigCone {
-    /// Returns the cone of the directions of `cameras`. If the optical axes do not meet in front of all of them, as for
-    /// parallel cameras, nothing is outside the cone.
+    /// Returns the cone of the directions from the point where the optical axes meet to each of `cameras`. If this
+    /// point is not in front of every camera, as for parallel cameras, there is no cone, and no camera counts as
+    /// outside.
     pub fn new(cameras: &[Camera]) -> RigCone {
         let focus = meeting_point(cameras);
         let is_ahead = |camera: &Camera| (camera.rotation * (focus - camera.center())).z > 0.0;
@@ -54,8 +56,8 @@ impl RigCone {
     }
 
     /// Returns the angle in radians, 0 to π/2, between this cone and the direction from [`RigCone::focus`] to `camera`.
-    /// Returns 0 if the direction is inside the cone, if the camera is at the focus, or if nothing is outside the cone
-    /// (see [`RigCone::new`]).
+    /// Returns 0 in three cases: the direction is inside the cone, the camera is at the focus, or there is no cone (see
+    /// [`RigCone::new`]).
     pub fn angle_outside(&self, camera: &Camera) -> f64 {
         let direction = (camera.center() - self.focus).try_normalize().filter(|_| !self.directions.is_empty());
         direction.map_or(0.0, |direction| self.angle(direction))
@@ -90,7 +92,7 @@ impl RigCone {
     ///
     /// The nearest point of the cone is Σ wᵢ·dᵢ for the weights wᵢ ≥ 0 that minimize ‖direction − Σ wᵢ·dᵢ‖, found by
     /// the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974, chapter 23). At most three
-    /// weights are above 0. The remainder is perpendicular to the nearest point.
+    /// weights are above 0. The remainder, `direction` minus the nearest point, is perpendicular to the nearest point.
     fn angle(&self, direction: DVec3) -> f64 {
         let mut used: Vec<(DVec3, f64)> = Vec::new();
         let mut rest = direction;
@@ -108,8 +110,9 @@ impl RigCone {
     }
 }
 
-/// Sets the weights of the unit vectors `used` so that their weighted sum is as near to `direction` as weights of at
-/// least 0 allow, and removes vectors whose weight is 0. Returns false if the vectors are linearly dependent.
+/// Changes the weights in `used`, which has pairs of a unit vector and its weight. Afterwards, the weighted sum of the
+/// vectors is as near to `direction` as weights of at least 0 allow. Removes vectors whose weight is 0. Returns false
+/// if the vectors are linearly dependent.
 fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(used, direction) else { return false };
@@ -124,9 +127,9 @@ fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     }
 }
 
-/// Returns the weights, of any sign, for which the weighted sum of the unit vectors in `used` is nearest to
-/// `direction`. The weights in `used` are ignored. Returns `None` if the vectors are linearly dependent or more than
-/// three.
+/// Returns the weights, of any sign, for which the weighted sum of unit vectors is nearest to `direction`. `used` has
+/// pairs of a unit vector and a weight, which is ignored. Returns `None` if the vectors are linearly dependent or more
+/// than three.
 fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
     match *used {
         [(a, _)] => Some(vec![a.dot(direction)]),
@@ -145,11 +148,13 @@ fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
     }
 }
 
-/// Returns at most `count` cameras outside the rig of `cameras`. Each is one of `cameras`, or a camera between two of
-/// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from
-/// the mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if hardly any direction is
-/// outside the rig, as for a rig all around the scene or for parallel cameras. The random numbers are the same in every
-/// run.
+/// Returns at most `count` cameras outside the rig of `cameras`. The random numbers are the same in every run.
+///
+/// - Each starts as one of `cameras`, or as a camera between two of them. It is then turned about the point where the
+///   optical axes meet, away from the mean direction of the rig. This multiplies its angle from the mean direction by a
+///   random factor from 1 to `max_factor`.
+/// - There are fewer than `count` if hardly any direction is outside the rig, as for a rig all around the scene.
+/// - There are none for parallel cameras.
 pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
     let cone = RigCone::new(cameras);
     let Some(middle) = cone.directions.iter().sum::<DVec3>().try_normalize() else { return Vec::new() };
@@ -191,10 +196,14 @@ fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
 
 impl Scene {
     /// Adds views from cameras outside the rig to the views of every frame (`self.schedule`), so that Gaussians that
-    /// only these views show are kept and refined. `reach`, from 0 to 1, states how much such views count. Angles from
-    /// the mean direction of the rig grow by a factor of up to 1 + `reach`. Every frame gets `reach` times as many
-    /// views outside the rig as it has inside. Adds no views if `reach` is 0 or if no camera outside the rig can be
-    /// found (see [`cameras_outside`]).
+    /// only these views show are kept and refined. `reach`, from 0 to 1, states how far outside these cameras are, and
+    /// how many views they add:
+    /// - Each added camera is made from a camera of the rig, or between two of them, by a rotation about the point
+    ///   where the optical axes meet. The rotation multiplies the camera's angle from the mean direction of the rig by
+    ///   up to 1 + `reach`.
+    /// - Every frame gets `reach` times as many views outside the rig as it has inside, rounded up.
+    ///
+    /// Adds no views if `reach` is 0 or if no camera outside the rig can be found (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {
         if reach == 0.0 {
             return;

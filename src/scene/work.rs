@@ -1,5 +1,5 @@
-//! Cache of a scene's stage results: the keys that all its entries depend on, and the digest (hash of the content) of
-//! the input.
+//! Opens the cache of a scene's stage results. Provides the digest (hash of the content) of the input, and the keys on
+//! which all entries of the cache depend.
 
 use std::fs;
 use std::path::Path;

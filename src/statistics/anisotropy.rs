@@ -1,6 +1,7 @@
-//! Anisotropy E of every Gaussian: how long its longest axis is compared with its other axes. Computed from one set of
-//! scales: the canonical scales of the model, or else those of the reference frame (the frame in which most Gaussians
-//! are alive).
+//! Computes the anisotropy E of every Gaussian: how long its longest axis is compared with its other axes.
+//!
+//! E is computed from one set of scales per Gaussian: the canonical scales of the model. A model without canonical
+//! Gaussians takes the scales of the reference frame instead, which is the frame in which most Gaussians are alive.
 
 use crate::model::{AnomalyFlags, AttributeValues, StatisticRows};
 use crate::recipe::Anisotropy;

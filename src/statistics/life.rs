@@ -1,5 +1,5 @@
-//! Life span (frames in which a Gaussian is alive) and opacity variance V. Both follow from the opacity at every frame
-//! alone.
+//! Computes two statistics of every Gaussian from its opacity at every frame: the life span (the frames in which the
+//! Gaussian is alive) and the opacity variance V.
 
 use std::mem::size_of;
 
@@ -17,7 +17,8 @@ pub(super) struct LifeSpans {
     frames: Vec<u32>,
     /// Number of Gaussians alive (opacity ≥ alpha_min) in the frame that was added last.
     alive: u32,
-    /// Number of frames that repeat the opacities of the first frame and are not counted in `frames` yet.
+    /// Number of frames with the opacities of the first frame that [`LifeSpans::repeat_frame`] has received and that
+    /// are not counted in `frames` yet.
     repeats: u32,
 }
 
@@ -57,16 +58,19 @@ impl LifeSpans {
         all
     }
 
-    /// Adds a frame with the same opacities as the first frame, and returns how many Gaussians are alive (opacity ≥
-    /// alpha_min) in it. All frames in between must also have had these opacities, so every α − α₁ is 0.
+    /// Adds a frame in which every Gaussian has the same opacity as in the first frame. Returns how many Gaussians are
+    /// alive (opacity ≥ alpha_min) in it.
+    ///
+    /// May be called only while all frames so far have had these opacities. The sums for V then stay unchanged, because
+    /// every difference α − α₁ from the opacity of the first frame is 0.
     #[inline(always)]
     pub(super) fn repeat_frame(&mut self) -> u32 {
         self.repeats += 1;
         self.alive
     }
 
-    /// Adds the frames that [`LifeSpans::repeat_frame`] has counted to the number of frames in which each Gaussian is
-    /// alive (opacity ≥ alpha_min). Must be called before results are read.
+    /// Adds the number of frames that [`LifeSpans::repeat_frame`] has received to the life span of every Gaussian that
+    /// is alive (opacity ≥ alpha_min) in them. Must be called before results are read.
     #[inline(always)]
     pub(super) fn count_repeats(&mut self) {
         if self.repeats > 0 {

@@ -34,9 +34,9 @@ const BORN_BEFORE: u8 = 4;
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// Number of frames after the first that repeat the opacities of the first frame and are not counted in `steps`,
-    /// `turns` and `history` yet. In these frames the same Gaussians are alive (opacity ≥ alpha_min). Used only by
-    /// `MotionParams::Runs`.
+    /// Number of frames that have the opacities of the first frame and are not counted in `steps`, `turns` and
+    /// `history` yet. The first frame itself is not included. In all these frames the same Gaussians are alive (opacity
+    /// ≥ alpha_min), so the frames can be counted together later. Used only by `MotionParams::Runs`.
     steady: u32,
     /// Positions in the previous frame, x(t−1). The field `before` holds the positions one frame earlier, x(t−2). Shape
     /// `[3, len]` each.
@@ -75,10 +75,13 @@ impl MotionSums {
         }
     }
 
-    /// Adds a frame with the positions `position` (`[3, len]`) and the opacities `opacity`. A Gaussian is alive if its
-    /// opacity is at least `alpha_min`. `steps` holds the durations of the latest time step and of the one before, each
-    /// divided by the mean duration of a step. `steady` is true if the opacities have been the same in every frame so
-    /// far, this one included.
+    /// Adds the next frame to the sums.
+    ///
+    /// - `position`: positions of the Gaussians, `[3, len]`.
+    /// - `opacity`: their opacities. A Gaussian is alive if its opacity is at least `alpha_min`.
+    /// - `steps`: duration of the time step into this frame, then of the time step before it, each divided by the mean
+    ///   duration of a step.
+    /// - `steady`: whether the opacities have been the same in every frame so far, this one included.
     #[inline(always)]
     pub(super) fn add_frame(
         &mut self,
@@ -101,10 +104,12 @@ impl MotionSums {
         self.frames += 1;
     }
 
-    /// Adds a frame with the positions `position` and the opacities `opacity`, by the definition `Runs` of motion: only
-    /// steps between consecutive frames in which the Gaussian is alive count. `steps` holds the durations of the last
-    /// two time steps, divided by the mean duration. `EVEN` states that both are 1, so that no division is needed;
-    /// divisions would take longer than the rest of the loop.
+    /// Adds the next frame by the definition `Runs` of motion: a step counts only if the Gaussian is alive in both of
+    /// its frames.
+    ///
+    /// `position` is `[3, len]`. `steps` holds the duration of the time step into this frame, then of the time step
+    /// before it, divided by the mean duration. `EVEN` states that both are 1. The divisions by them, which would take
+    /// longer than the rest of the loop, are then left out.
     #[inline(always)]
     fn add_frame_of_runs<const EVEN: bool>(
         &mut self,
@@ -132,9 +137,9 @@ impl MotionSums {
         }
     }
 
-    /// Does the same as [`MotionSums::add_frame_of_runs`] for a frame whose opacities equal the opacities of all
-    /// earlier frames. The steps and turns that count are then known without reading the history, so half as much
-    /// memory is accessed (`cargo bench --bench scan`).
+    /// Adds the next frame by the definition `Runs` of motion if its opacities equal the opacities of all earlier
+    /// frames. The result is the same as with [`MotionSums::add_frame_of_runs`]. The steps and turns that count are
+    /// known without reading the history, so half as much memory is accessed (`cargo bench --bench scan`).
     #[inline(always)]
     fn add_steady_frame<const EVEN: bool>(&mut self, position: &AttributeValues, steps: [f64; 2]) {
         self.steady += 1;
@@ -149,9 +154,9 @@ impl MotionSums {
         }
     }
 
-    /// Counts the frames with unchanged opacities (`steady`) in the numbers of steps and turns of each Gaussian that is
-    /// alive (opacity ≥ alpha_min). Sets the sums of steps and turns of the other Gaussians to 0. Must be called before
-    /// results are read.
+    /// Adds the frames counted in `steady` to the numbers of steps and turns of each Gaussian that is alive (opacity ≥
+    /// alpha_min) in them. The other Gaussians have not been alive in any frame yet, so their sums of steps and turns
+    /// are set to 0. Must be called before results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
@@ -236,8 +241,8 @@ impl MotionSums {
     }
 }
 
-/// Returns the x, y and z values of the `n` positions in `column`. Slicing to `n` shows the compiler that the lengths
-/// are equal, which removes the bounds checks.
+/// Returns the planes of x, y and z values of `column`, each as a slice of `n` values. Equal lengths that the compiler
+/// can see remove the bounds checks.
 #[inline(always)]
 fn planes(column: &AttributeValues, n: usize) -> [&[f32]; 3] {
     std::array::from_fn(|axis| &column.plane(axis)[..n])
@@ -250,11 +255,13 @@ fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
     [x[i], y[i], z[i]]
 }
 
-/// Returns two values: the squared length of the last step (change of position), and the length of the turn (second
-/// difference of the positions) about the previous frame. Both are scaled to time steps of the mean duration. `now`,
-/// `previous` and `before` are the positions in the current frame and in the two frames before it. `step` and
-/// `step_before` are the durations of the last two time steps, divided by the mean duration. With fewer than three
-/// frames the values are meaningless.
+/// Returns two values of one Gaussian: the squared length of its last step (change of position), and the length of its
+/// turn (second difference of the positions) about the previous frame. Both are scaled to time steps of the mean
+/// duration.
+///
+/// `now`, `previous` and `before` are its positions in the current frame and in the two frames before it. `step` and
+/// `step_before` are the durations of the last two time steps, divided by the mean duration; `EVEN` states that both
+/// are 1. The step is meaningless in the first frame, and the turn in the first two frames.
 #[inline(always)]
 fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
     let (mut step2, mut turn2) = (0.0, 0.0);
@@ -276,8 +283,8 @@ fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, 
     (step2, turn2.sqrt())
 }
 
-/// Returns the history bits for the next frame: the current frame, in which the Gaussian is `alive` or not, becomes the
-/// previous one.
+/// Returns the history bits of a Gaussian that are needed in the next frame. `history` holds the bits that were needed
+/// in the current frame, and `alive` says whether the Gaussian is alive in the current frame.
 #[inline(always)]
 fn next_history(history: u8, alive: bool) -> u8 {
     let now = if alive { ALIVE } else { 0 };

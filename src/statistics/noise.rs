@@ -1,4 +1,4 @@
-//! Removal of apparent motion that is only the rounding of positions to f32.
+//! Removes apparent motion that is only the rounding of positions to f32.
 //!
 //! A resting Gaussian whose positions are rounded to f32 has a trajectory magnitude D ≈ 0.71 ulp and a curvature κ ≈
 //! 1.2 ulp, where one ulp is the distance between neighboring f32 values. All coordinates of a scene share one offset,
@@ -28,7 +28,9 @@ pub fn ulp(x: f32) -> f64 {
 }
 
 /// Sets every trajectory magnitude D below 2 ulp and every curvature κ below 4 ulp of `largest_coordinate` to exactly
-/// 0, and sets a flag in each row that changes. Returns how many values of D and of κ were set to 0.
+/// 0. Marks each Gaussian whose D or κ changes with the flag `SNAPPED_D` or `SNAPPED_KAPPA`. Returns how many values of
+/// D and of κ were set to 0.
+///
 /// `largest_coordinate` is the largest |coordinate| of the whole scene, at least 0. Values that are 0 already are
 /// neither flagged nor counted.
 pub fn snap_noise_to_zero(rows: &mut StatisticRows, largest_coordinate: f32) -> SnapCounts {

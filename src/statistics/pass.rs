@@ -75,10 +75,12 @@ pub fn scan_blocks(
 }
 
 impl ScanResult {
-    /// Converts the result of a scan that read only the frames `frames` (increasing) into a result for the whole
-    /// sequence, which has `all` frames. Life spans grow in proportion. Frames that were not read have no Gaussians
-    /// alive (opacity ≥ alpha_min). Sets D, κ and V to 0, because steps between the frames that were read are not the
-    /// steps of the sequence.
+    /// Converts the result of a scan that read only the frames `frames` (increasing indices) into a result for the
+    /// whole sequence, which has `all` frames.
+    ///
+    /// - Life spans grow in proportion to the number of frames.
+    /// - The number of Gaussians alive (opacity ≥ alpha_min) is 0 in frames that were not read.
+    /// - D, κ and V become 0, because steps between the frames that were read are not the steps of the sequence.
     pub fn extrapolate_to_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
         let mut alive_per_frame = vec![0; all];
         frames.iter().zip(&self.alive_per_frame).for_each(|(&frame, &alive)| alive_per_frame[frame] = alive);
@@ -112,8 +114,8 @@ fn joined(blocks: impl IntoIterator<Item = (StatisticRows, f32)>, alive_per_fram
     ScanResult { rows, alive_per_frame, largest_coordinate, is_partial: false }
 }
 
-/// Scan of frames that arrive over time. It gives the same result as [`scan`], and takes the frames in groups, each of
-/// which is read once.
+/// Scan of a sequence whose frames arrive over time, in groups. Each group is read once, when it is added. The result
+/// is the same as that of [`scan`].
 ///
 /// Memory: the accumulators of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), 4 bytes per frame, and
 /// per thread the attributes of one block of Gaussians at one frame.
@@ -168,7 +170,8 @@ impl<'a> RunningScan<'a> {
         Ok(())
     }
 
-    /// Returns the result after the last frame. `plan` is the plan for the complete sequence.
+    /// Ends the scan after the last frame, and returns the statistics of all Gaussians. `plan` is the plan for the
+    /// complete sequence, as [`ScanPlan::new`] creates it.
     ///
     /// # Panics
     /// Panics if `plan` does not belong to the frames that were added ([`ScanPlan::fits_scan_begun_with`]).

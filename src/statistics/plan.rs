@@ -101,8 +101,9 @@ impl ScanPlan {
         }
     }
 
-    /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`: whether
-    /// the plans differ at most in the numbers of frames and of (frame, view) pairs.
+    /// Returns whether a scan that began with the plan `arriving`, made before the frames arrived, can end with this
+    /// plan, which was made for all frames. The two plans may differ only in the numbers of frames and of (frame, view)
+    /// pairs.
     pub fn fits_scan_begun_with(&self, arriving: &ScanPlan) -> bool {
         *arriving == ScanPlan { frames: arriving.frames, pair_count: arriving.pair_count, ..self.clone() }
     }
@@ -117,8 +118,8 @@ impl ScanPlan {
         self.pair_count
     }
 
-    /// Returns the resolution of the contribution C in pixels. Contributions are summed as integer multiples of this
-    /// number, so their sum is the same in any order.
+    /// Returns the fixed-point unit of contributions in pixels. Every contribution C (covered pixels times opacity) to
+    /// a view is rounded to a multiple of this unit, so the sum over views is the same in any order.
     pub fn coverage_resolution_px(&self) -> f64 {
         2f64.powi(-self.coverage_exponent)
     }
@@ -130,7 +131,8 @@ impl ScanPlan {
 }
 
 /// Returns the durations of the steps between the frames at `times`, divided by their mean. Entry t is the step into
-/// frame t; entry 0 is unused. Returns an empty list if all steps count as equal.
+/// frame t; entry 0 is unused. Returns an empty list if the frames are evenly spaced: every step differs from the mean
+/// by at most 1% of it.
 fn uneven_steps(times: &[f64]) -> Vec<f64> {
     let [first, .., last] = times else { return Vec::new() };
     let mean = (last - first) / (times.len() - 1) as f64;

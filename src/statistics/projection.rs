@@ -190,7 +190,8 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// Computes standard deviations and determinant of the 2-D covariance of each projected Gaussian.
+    /// Computes the standard deviations along x and y and the root of the determinant of the 2-D covariance of each
+    /// projected Gaussian. `axes` is the matrix R·S (rotation times scales) of each Gaussian, entry by entry.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "i runs over many planes at once")]
     fn project_covariances(&mut self, view: &ScanView, axes: [&[f64; N]; 9]) {
@@ -244,9 +245,11 @@ impl<const N: usize> ProjectedBlock<N> {
     }
 }
 
-/// Returns a row of J·W (Jacobian times camera rotation), which is the gradient of one pixel coordinate with respect to
-/// the position: f/z·(w − slope·w₂). `focal_over_depth` is f/z, `w` the camera axis of this coordinate, `w2` the
-/// viewing axis.
+/// Returns a row of J·W (Jacobian times camera rotation): the gradient of one pixel coordinate (u or v) with respect to
+/// the position, f/z·(w − slope·w₂).
+///
+/// `focal_over_depth` is f/z, `slope` is x/z for u and y/z for v, `w` is the camera axis that belongs to the
+/// coordinate, and `w2` is the viewing axis.
 #[inline(always)]
 fn jacobian_row(focal_over_depth: f64, slope: f64, w: &[f64; 3], w2: &[f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| focal_over_depth * (w[k] - slope * w2[k]))
@@ -290,8 +293,9 @@ mod tests {
         (hash_id(k as u64) >> 11) as f64 / 2f64.powi(53)
     }
 
-    /// Runs `with` on random Gaussians around a camera, including some behind it and some very large ones, and returns
-    /// the sums.
+    /// Runs `with`, one implementation of the projection, on random Gaussians around a camera, some of them behind it
+    /// and some very large. Returns two values of each Gaussian: the covered pixels times opacity, in fixed point, and
+    /// the number of views in which its bounding box overlaps the image.
     fn run_on_random_gaussians(
         with: impl Fn(&ScanView, &FootprintPlanes<'_>, CoverageScale, &mut CoverageSums<'_>),
     ) -> (Vec<u64>, Vec<u32>) {

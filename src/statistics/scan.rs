@@ -142,9 +142,9 @@ impl<'a> BlockScan<'a> {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// Updates the decoded attributes, the life spans and the motion sums with frame `t`, in which the attributes
-    /// `changed` of `gaussians` may differ from the previous frame. The compiler inlines this function and the loops it
-    /// calls into the copy for each instruction set.
+    /// Updates the state, the life spans and the motion sums of the block with frame `t`. `changed` names the
+    /// attributes of `gaussians` that may differ from the previous frame. The compiler inlines this function and the
+    /// loops that it calls into one copy per instruction set.
     #[inline(always)]
     fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.state.update(gaussians, changed);
@@ -188,14 +188,14 @@ impl<'a> BlockScan<'a> {
         self.state.resident_bytes() + self.life.resident_bytes() + self.motion.resident_bytes() + sums
     }
 
-    /// Returns the statistics after all frames have been added.
+    /// Ends the scan after the last frame, and returns the statistics of every Gaussian of the block.
     pub fn finish(self) -> BlockStatistics {
         let plan = self.plan;
         self.finish_with_plan(plan)
     }
 
-    /// Returns the statistics of a scan that began before all frames were known. `plan` is the plan for the complete
-    /// sequence.
+    /// Ends a scan that began before all frames were known, and returns the statistics of every Gaussian of the block.
+    /// `plan` is the plan for the complete sequence.
     ///
     /// # Panics
     /// Panics if frames are missing, or if `plan` does not belong to this scan: only the number of frames and of

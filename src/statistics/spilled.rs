@@ -42,9 +42,8 @@ impl<'de> Deserialize<'de> for StatisticsRows {
 }
 
 impl StatisticsRows {
-    /// Moves `rows` from memory to an unnamed temporary file in `folder`. Returns the handle from which the rows can be
+    /// Moves `rows` from memory to an unnamed temporary file in `folder`. Returns a handle, from which the rows can be
     /// read again.
-    ///
     ///
     /// # Errors
     /// Fails if the file cannot be created or written.
@@ -71,8 +70,8 @@ impl StatisticsRows {
         }
     }
 
-    /// Returns two values of every Gaussian: the contribution C, and Vis, the fraction of the views in which it is on
-    /// screen.
+    /// Returns two lists with one value per Gaussian: the contribution C, and Vis, the fraction of the (frame, view)
+    /// pairs in which the Gaussian is alive and on screen.
     pub(crate) fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
         Ok(match self {
             StatisticsRows::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
@@ -112,8 +111,8 @@ impl SpilledRows {
         self.values(&self.columns[..index])
     }
 
-    /// Reads the values of one statistic, or the flags, for all Gaussians. `before` lists the statistics whose values
-    /// precede them in the file.
+    /// Reads the values of one statistic, or the flags, for all Gaussians. `before` lists all statistics that are
+    /// stored before these values in the file; their size gives the offset at which to read.
     fn values<T: AnyBitPattern + NoUninit>(&self, before: &[Statistic]) -> Result<Vec<T>> {
         let start = before.iter().map(|statistic| statistic.bytes() as u64).sum::<u64>() * self.count as u64;
         let mut values = vec![T::zeroed(); self.count];

@@ -277,8 +277,8 @@ fn zero_quaternion_is_flagged_and_counts_as_identity() {
     assert_eq!((got.c, got.flags), (expected.c, vec![AnomalyFlags::ZERO_ROTATION, AnomalyFlags::empty()]));
 }
 
-/// Returns three values of one Gaussian in one view: the area that it covers (pixels) and its visibility, both from the
-/// scan; and the area from the slow reference (oracle).
+/// Measures one Gaussian in one view. Returns three values: the area that it covers (pixels) and its visibility, both
+/// computed by the scan, and then the area as computed by the slow reference (oracle).
 fn one_view(position: DVec3, scale: [f64; 3], rotation: [f32; 4]) -> (f64, f64, f64) {
     let schedule = schedule(1, 1);
     let mut g = Gaussians::zeros(1, 0);

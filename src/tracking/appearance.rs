@@ -1,4 +1,5 @@
-//! Appearance of a Gaussian, as far as tracking compares it between frames, and the cost of differences in appearance.
+//! Appearance of a Gaussian (size, shape, opacity, base color), as far as tracking compares it between frames, and the
+//! cost of a difference in appearance.
 
 use rayon::prelude::*;
 
@@ -8,7 +9,8 @@ use crate::model::{AttributeValues, Gaussians, SH_C0};
 /// stay finite in f32.
 const MAX_LOG_SCALE: f32 = 30.0;
 /// Units in which two Gaussians are compared: a difference of one unit in size, shape, opacity or color adds 1 to the
-/// cost of linking them. The difference in size is the natural log of the ratio of the sizes.
+/// cost of linking them (linking needs a cost of at most 1). The difference in size is the natural log of the ratio of
+/// the sizes.
 const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
 const SHAPE_UNIT: f32 = 0.25;
 const OPACITY_UNIT: f32 = 0.5;
@@ -73,7 +75,8 @@ impl ComparedAppearance {
         ComparedAppearance { position, ..self }
     }
 
-    /// Returns the sum of the color channels. It selects the Gaussians that are compared if a grid cell holds too many.
+    /// Returns the sum of the three color channels. If a grid cell holds too many Gaussians to compare with all of
+    /// them, those with the nearest brightness are compared.
     pub(super) fn brightness(&self) -> f32 {
         self.color.iter().sum()
     }
@@ -123,8 +126,8 @@ pub(super) fn mix(x: u64) -> u64 {
     (x ^ (x >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93)
 }
 
-/// Returns the matrix R·diag(v)·Rᵀ in the form of [`ComparedAppearance::shape`]. R is the rotation of the wxyz
-/// quaternion, which may have any length; a zero quaternion is the identity.
+/// Returns six entries of the symmetric matrix R·diag(v)·Rᵀ: xx, yy, zz, and √2 times xy, xz and yz. R is the rotation
+/// of the wxyz quaternion, which may have any length; a zero quaternion is the identity.
 fn shape(quaternion: [f32; 4], v: [f32; 3]) -> [f32; 6] {
     let length = quaternion.iter().map(|x| x * x).sum::<f32>();
     let [w, x, y, z] = if length == 0.0 { [1.0, 0.0, 0.0, 0.0] } else { quaternion };

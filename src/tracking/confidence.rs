@@ -1,26 +1,32 @@
-//! Probability that links between tracks and Gaussians are wrong, and removal of the doubtful links.
+//! Estimates for each link between a track (Gaussian followed through frames) and a Gaussian the probability that it is
+//! wrong, and removes doubtful links.
 
 use super::appearance::ComparedAppearance;
 use super::links::Links;
 use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Maximum fraction of a frame's links that may be wrong, as an expected value. Doubtful links are removed down to it.
+/// Maximum fraction of the links of a frame that may be wrong, as an expected value. If more are expected to be wrong,
+/// the least certain links are removed.
 pub(super) const MAX_WRONG: f64 = 0.005;
-/// Cost that is added to the numerator and to the denominator of each ratio of link costs. As a result, two costs that
-/// differ by less than this count as equal.
+/// Cost that is added to the numerator and to the denominator of each ratio of link costs (distance and difference in
+/// appearance of linked Gaussians). As a result, two costs that differ by less than this count as equal.
 const COST_TOLERANCE: f32 = 1e-6;
-/// Assumed probability that a track's own Gaussian is absent from a frame, although an unrelated one lies within reach.
+/// Assumed probability that the Gaussian of a track (Gaussian followed through frames) is absent from a frame, although
+/// an unrelated one lies within reach.
 const ABSENCE_PROBABILITY: f32 = 0.25;
 
-/// Estimates of how many of a frame's links between tracks and Gaussians are wrong.
+/// Estimates of how many of a frame's links between tracks (Gaussians followed through frames) and Gaussians are wrong.
 pub(super) struct LinkConfidence {
     /// Expected number of wrong links: the sum of the probabilities that a link is wrong.
     expected_wrong: f64,
     /// Probability and track number of each link that is wrong with a probability above [`MAX_WRONG`].
     doubtful: Vec<(f32, u32)>,
-    /// For every track the largest ratio R over all rivals of its link; 0 without a rival. A rival is another track or
-    /// another Gaussian that could take one end of the link. R is the cost of the present links, divided by their cost
-    /// after the link and its rival are exchanged. The larger R is, the more likely the link is wrong.
+    /// Ratio R of each track (Gaussian followed through frames); 0 for a track without a rival. A rival is another
+    /// track or another Gaussian that could take one end of the track's link.
+    ///
+    /// R is the cost (distance and difference in appearance) of the present links, divided by their cost after the link
+    /// and the link of the rival exchange their Gaussians. With several rivals, the largest R counts. The larger R is,
+    /// the more likely the link is wrong.
     ratios: Vec<f32>,
 }
 
@@ -29,9 +35,12 @@ impl LinkConfidence {
         LinkConfidence { expected_wrong: 0.0, doubtful: Vec::new(), ratios: vec![0.0; tracks] }
     }
 
-    /// Updates the estimates with the links that one round of linking made. `candidates_by_track` holds, for each track
-    /// that took part in the round, the Gaussians that might have continued it. Costs of links follow from the
-    /// parameters of `round`.
+    /// Adds the links between tracks (Gaussians followed through frames) and Gaussians that one round of linking made
+    /// to the estimates.
+    ///
+    /// - `candidates_by_track`: for each track that took part in the round, the Gaussians that might have continued it.
+    /// - `tracks` and `appearances`: all open tracks, and the appearances of all Gaussians of the frame.
+    /// - `round`: parameters of the round, from which the costs of links follow.
     pub(super) fn add_round(
         &mut self,
         links: &Links,

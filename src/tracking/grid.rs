@@ -68,9 +68,13 @@ impl CellGrid {
         CellGrid { reach, mask, starts, cells, entries }
     }
 
-    /// Calls `visit` with the number and appearance of every Gaussian whose size is about that of `appearance` and
-    /// whose position differs from `center` by at most `radius` (scene units) along each axis. Some Gaussians farther
-    /// away are visited too.
+    /// Calls `visit` with the number and the appearance of every Gaussian that satisfies two conditions:
+    ///
+    /// - its size is that of `appearance` within a factor of √2;
+    /// - its position differs from `center` by at most `radius` (scene units) along each axis.
+    ///
+    /// Other Gaussians in the visited cells are passed to `visit` too. In a cell with more than 64 Gaussians, only the
+    /// 64 with the nearest brightness are visited.
     pub(super) fn for_each_near(
         &self,
         appearance: &ComparedAppearance,
@@ -131,9 +135,11 @@ fn levels(ln_size: f32) -> RangeInclusive<i64> {
     floor(octave - 0.5)..=floor(octave + 0.5)
 }
 
-/// Returns the width of the grid cells for Gaussians of octave `level`, in scene units. The octave contains the sizes
-/// from 2^level to 2^(level + 1) scene units. Cells are made for searches whose radius is `reach` times the size of a
-/// Gaussian: they are as wide as the diameter of such a search for the largest size of the octave.
+/// Returns the width of the grid cells for octave `level`, in scene units. This octave contains the Gaussians of the
+/// sizes from 2^level to 2^(level + 1) scene units.
+///
+/// A search has a radius of `reach` times the size of a Gaussian. Cells are as wide as the diameter of the search for
+/// the largest Gaussian of the octave.
 fn side(level: i64, reach: f64) -> f64 {
     2.0 * reach * ((level + 1) as f64).exp2()
 }

@@ -1,4 +1,5 @@
-//! Test whether equal indices in two frames denote the same Gaussian, so that frames need not be linked.
+//! Tests whether Gaussians at equal indices in two frames are the same Gaussian. Such frames need not be linked by
+//! tracking.
 
 use super::appearance::ComparedAppearance;
 use crate::model::Gaussians;
@@ -30,15 +31,19 @@ pub struct OrderDifference {
     /// Median difference in appearance, in the unit of `appearance_difference`, between unrelated Gaussians (index i of
     /// the first frame and i + N/2 of the second).
     pub unrelated_appearance_difference: f64,
-    /// Whether equal indices in the two frames denote the same Gaussian: `position_difference` is at most half of
-    /// `unrelated_position_difference` or no more than rounding, and `appearance_difference` is at most half of
-    /// `unrelated_appearance_difference` or no more than rounding. Always true for fewer than 16 Gaussians.
+    /// Whether equal indices in the two frames denote the same Gaussian. This is true in two cases:
+    ///
+    /// - There are fewer than 16 Gaussians.
+    /// - Both differences at the same index, `position_difference` and `appearance_difference`, are small: each is at
+    ///   most half of the corresponding difference between unrelated Gaussians, or at most 1e-3 (rounding).
     pub is_common: bool,
 }
 
-/// Compares the frames `before` and `after`, which have equally many Gaussians, index by index, at up to 4096 indices.
-/// The frames always count as being in the same order if there are fewer than 16 Gaussians, or if Gaussians at the same
-/// index differ by no more than rounding.
+/// Tests whether two frames with equally many Gaussians have the same order of Gaussians. Compares the Gaussians of
+/// `before` and `after` at the same index, at up to 4096 indices.
+///
+/// The order always counts as the same if there are fewer than 16 Gaussians, or if Gaussians at the same index differ
+/// by no more than rounding.
 pub fn compare_order(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     let (before, after) = (ComparedAppearance::all_from_state(before), ComparedAppearance::all_from_state(after));
     let count = before.len().min(after.len());

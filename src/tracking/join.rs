@@ -1,5 +1,5 @@
-//! Joining of tracks that belong to one Gaussian: a track that ends, and a similar one that begins where and when the
-//! first one ends.
+//! Joins tracks (Gaussians followed through frames) that belong to one Gaussian: a track that ends, and a similar track
+//! that begins where and when the first one ends.
 
 use std::mem::size_of;
 
@@ -11,31 +11,34 @@ use super::linker::Linker;
 use super::track::{Candidate, Candidates, MAX_CANDIDATES, NONE, OpenTrack, Round};
 use crate::model::{AttributeValues, Gaussians};
 
-/// Rules for joining two tracks: `ALIKE` for tracks that may be one Gaussian; `CLOSE`, which is stricter, for tracks
-/// that look the same. Two tracks may be joined if the cost of their pair is at most 1. In this cost, `reach` scales
-/// the distance and `strictness` the difference in appearance.
+/// Rules for joining two tracks (Gaussians followed through frames): `ALIKE` for tracks that may be one Gaussian;
+/// `CLOSE`, which is stricter, for tracks that look the same. Two tracks may be joined if the cost of their pair is at
+/// most 1. In this cost, `reach` scales the distance and `strictness` the difference in appearance.
 const ALIKE: Round = Round { reach: 4.0, strictness: 1.0 / 16.0, includes_missing: true };
 const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, includes_missing: true };
-/// Largest ratio of the sizes of joined tracks, as a natural log: ln √2. The grid that finds similar Gaussians finds no
-/// other sizes.
+/// Largest ratio of the sizes of joined tracks (Gaussians followed through frames), as a natural log: ln √2. The grid
+/// that finds similar Gaussians finds no other sizes.
 const MAX_LN_SIZE_RATIO: f32 = std::f32::consts::LN_2 / 2.0;
-/// Largest count of shared frames with which two tracks may still be joined. A frame in which both tracks are present
-/// raises the count by 1; a frame in which one of them is missing lowers it by 1, down to 0. Some shared frames are
-/// allowed because a Gaussian may fade out as one track while it fades in as the other.
+/// Largest count of shared frames with which two tracks (Gaussians followed through frames) may still be joined. A
+/// frame in which both tracks are present raises the count by 1; a frame in which one of them is missing lowers it by
+/// 1, down to 0. Some shared frames are allowed because a Gaussian may fade out as one track while it fades in as the
+/// other.
 const MAX_SHARED_FRAMES: u8 = 4;
 
-/// Rules by which tracks are joined. Tracks that satisfy the second rule also satisfy the first.
+/// Rules by which tracks (Gaussians followed through frames) are joined. Tracks that satisfy the second rule also
+/// satisfy the first.
 const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 
-/// Joiner of tracks that belong to the same Gaussian. It computes two alternative results: the tracks joined by the
-/// rule `ALIKE`, and the tracks joined by the stricter rule `CLOSE`. Every frame is passed to it after the [`Linker`]
-/// has linked the frame.
+/// Joiner of tracks (Gaussians followed through frames) that belong to the same Gaussian. It computes two alternative
+/// results: the tracks joined by the rule `ALIKE`, and the tracks joined by the stricter rule `CLOSE`. Every frame is
+/// passed to it after the [`Linker`] has linked the frame.
 pub struct Joiner([JoinedTracks; 2]);
 
-/// Pairs of tracks that are or may be joined by one of the two [`RULES`].
+/// Pairs of tracks (Gaussians followed through frames) that are or may be joined by one of the two [`RULES`].
 struct JoinedTracks {
     rule: &'static Round,
-    /// Pairs of tracks that may still be joined, in the order of the later track, then of cost.
+    /// Pairs of tracks that are not joined yet and may still be. Sorted by the number of the later track, then by cost
+    /// (distance and difference in appearance).
     pairs: Vec<TrackPair>,
     /// For each track the number of the earlier track that it is joined to; `NONE` if there is none.
     predecessor: Vec<u32>,
@@ -43,7 +46,7 @@ struct JoinedTracks {
     has_successor: Vec<bool>,
 }
 
-/// Pair of a track and an earlier track that it may continue.
+/// Pair of a track (Gaussian followed through frames) and an earlier track that it may continue.
 #[derive(Debug, Clone, Copy)]
 struct TrackPair {
     track: u32,
@@ -66,15 +69,17 @@ impl Default for Joiner {
 }
 
 impl Joiner {
-    /// Bytes of memory of the joiner for each track begun so far, the result of [`Joiner::finish`] included. Each list
-    /// is counted twice, because it is copied when it grows.
+    /// Bytes of memory of the joiner for each track (Gaussian followed through frames) begun so far, the result of
+    /// [`Joiner::finish`] included. Each list is counted twice, because it is copied when it grows.
     pub const BYTES_PER_TRACK: usize = 2 * RULES.len() * (size_of::<u32>() + size_of::<bool>());
-    /// Bytes of memory for each open track, that is, each track that may still continue.
+    /// Bytes of memory for each open track, that is, each track (Gaussian followed through frames) that may still
+    /// continue.
     pub const BYTES_PER_OPEN_TRACK: usize = 2 * size_of::<ComparedAppearance>()
         + 6 * size_of::<u32>()
         + RULES.len() * MAX_CANDIDATES * (size_of::<Candidate>() + 2 * size_of::<TrackPair>());
 
-    /// Updates the pairs of tracks by the frame that `linker` has linked last; to be called after every frame.
+    /// Updates the pairs of tracks (Gaussians followed through frames) by the frame that `linker` has linked last; to
+    /// be called after every frame.
     pub fn add_frame(&mut self, linker: &Linker) {
         let tracks = linker.open_tracks();
         let born = self.0[0].predecessor.len();
@@ -88,9 +93,9 @@ impl Joiner {
         self.add_pairs(old, new);
     }
 
-    /// Adds the pairs of tracks that may be joined. `new` holds the tracks that begin in this frame; `old` holds the
-    /// tracks that began earlier and may still continue. A pair consists of a track of `new` and a similar track of
-    /// `old`.
+    /// Adds the pairs of tracks (Gaussians followed through frames) that may be joined. `new` holds the tracks that
+    /// begin in this frame; `old` holds the tracks that began earlier and may still continue. A pair consists of a
+    /// track of `new` and a similar track of `old`.
     fn add_pairs(&mut self, old: &[OpenTrack], new: &[OpenTrack]) {
         if old.is_empty() || new.is_empty() {
             return;
@@ -136,18 +141,25 @@ impl Joiner {
         }
     }
 
-    /// Ends the joining; to be called after the last frame. Returns two values for each rule (`ALIKE` first): a list
-    /// that holds, for every track in the order in which tracks began, the index of its joined track; and the number of
-    /// joined tracks. `linker` is the linker of the last frame.
+    /// Ends the joining of tracks (Gaussians followed through frames); to be called after the last frame, with the
+    /// linker of that frame. Returns a result for the rule `ALIKE` and one for the rule `CLOSE`, each a pair of
+    ///
+    /// - a list with the number of the joined track of every track, in the order in which the tracks began;
+    /// - the number of joined tracks.
     pub fn finish(self, linker: &Linker) -> [(Vec<u32>, usize); 2] {
         self.0.map(|joined| joined.finish(linker))
     }
 }
 
 impl JoinedTracks {
-    /// Updates the pairs by a frame whose open tracks are `tracks`. Removes pairs that no longer satisfy the rule, and
-    /// marks pairs whose earlier track has ended. If the later track of a pair has ended first, removes the pair, and
-    /// joins its tracks if they were close.
+    /// Updates the pairs of tracks (Gaussians followed through frames) after a frame. `tracks` are the open tracks
+    /// after this frame; a track that is not among them has ended. The result for a pair depends on its tracks:
+    ///
+    /// - The earlier track has ended: the pair is marked.
+    /// - The later track has ended first: its tracks are joined if they satisfied the rule `CLOSE`. The pair is
+    ///   removed.
+    /// - Both are present in this frame: the pair is removed if they do not satisfy the rule, or share too many frames.
+    /// - One of them is missing in this frame: the count of shared frames is lowered.
     fn update_pairs(&mut self, tracks: &[OpenTrack]) {
         let find = |number: u32| tracks.binary_search_by_key(&number, |track| track.number).ok().map(|at| &tracks[at]);
         let rule = self.rule;
@@ -186,8 +198,9 @@ impl JoinedTracks {
         self.pairs.retain(|pair| predecessor[pair.track as usize] == NONE);
     }
 
-    /// Joins each track to the earlier track of its cheapest pair if that earlier track has ended. Goes through the
-    /// pairs in the order of cost; each track continues at most one other and is continued by at most one.
+    /// Joins pairs of tracks (Gaussians followed through frames) whose earlier track has ended. A later track is joined
+    /// only by its pair of lowest cost (distance and difference in appearance). Pairs are joined in the order of cost.
+    /// Each track continues at most one other, and at most one other continues it.
     fn join_ended(&mut self) {
         loop {
             let firsts = self.pairs.chunk_by(|a, b| a.track == b.track).map(|pairs| pairs[0]);
@@ -209,8 +222,8 @@ impl JoinedTracks {
         }
     }
 
-    /// Ends the joining by one rule. Returns for each track the index of its joined track, and the number of joined
-    /// tracks.
+    /// Ends the joining of tracks (Gaussians followed through frames) by one rule. Returns for each track the number of
+    /// its joined track, then the number of joined tracks.
     fn finish(mut self, linker: &Linker) -> (Vec<u32>, usize) {
         let open_tracks = linker.open_tracks();
         self.pairs.retain_mut(|pair| {
@@ -235,9 +248,9 @@ impl JoinedTracks {
     }
 }
 
-/// Returns the cost of joining two tracks by `rule`, computed from the appearances of both. The tracks may be joined if
-/// the cost is at most 1. Opacity does not count. Returns infinity if one Gaussian is more than √2 times as large as
-/// the other.
+/// Returns the cost of joining two tracks (Gaussians followed through frames) by `rule`: their squared distance plus
+/// the difference of their appearances, both scaled by `rule`. The tracks may be joined if the cost is at most 1.
+/// Opacity does not count. Returns infinity if one Gaussian is more than √2 times as large as the other.
 fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     if (a.ln_size - b.ln_size).abs() > MAX_LN_SIZE_RATIO {
         return f32::INFINITY;

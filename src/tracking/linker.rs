@@ -1,4 +1,5 @@
-//! Linking of frames in time order: finds which Gaussian of a frame continues which track.
+//! Linking of frames in time order: finds which Gaussian of a frame continues which track (Gaussian followed through
+//! frames).
 
 use std::mem::size_of;
 
@@ -11,26 +12,28 @@ use super::links::Links;
 use super::track::{Candidate, MAX_CANDIDATES, NONE, OpenTrack, ROUNDS};
 use crate::model::Gaussians;
 
-/// Maximum number of consecutive frames in which a track may have no Gaussian before it ends.
+/// Maximum number of consecutive frames in which a track (Gaussian followed through frames) may have no Gaussian before
+/// it ends.
 pub const MAX_GAP_FRAMES: u32 = 3;
-/// Parameters of the test whether a Gaussian has taken the place of a track that has no Gaussian in this frame. The
-/// first is the distance from the expected position, in sizes of the Gaussian, that adds 1 to the cost. The second is
-/// the factor by which the difference in appearance is multiplied. The Gaussian passes the test if the cost is at most
-/// 1.
+/// Parameters of the test whether a Gaussian has taken the place of a track (Gaussian followed through frames) that has
+/// no Gaussian in this frame. The first is the distance from the expected position, in sizes of the Gaussian, that adds
+/// 1 to the cost. The second is the factor by which the difference in appearance is multiplied. The Gaussian passes the
+/// test if the cost is at most 1.
 const SUCCESSION: (f32, f32) = (0.25, 1.0);
 /// Minimum number of Gaussians of a frame for the detection of cuts (frames whose content is unrelated to the frame
 /// before).
 const MIN_FOR_CUT: usize = 16;
 
-/// Linker of the Gaussians of successive frames into tracks. It takes the frames one by one in time order.
+/// Linker of the Gaussians of successive frames into tracks (Gaussians followed through frames). It takes the frames
+/// one by one in time order.
 #[derive(Default)]
 pub struct Linker {
-    /// Tracks that may still continue, in the order of their numbers.
+    /// Tracks (Gaussians followed through frames) that may still continue, in the order of their numbers.
     tracks: Vec<OpenTrack>,
     born: u32,
 }
 
-/// Result of linking the Gaussians of one frame to tracks.
+/// Result of linking the Gaussians of one frame to tracks (Gaussians followed through frames).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FrameLinks {
     /// For every Gaussian the number of the track that it continues or begins.
@@ -48,28 +51,29 @@ pub struct FrameLinks {
 impl Linker {
     /// Bytes of memory for each Gaussian of the frame that is being linked, not counting the frame itself.
     pub const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<ComparedAppearance>() + 9 * size_of::<u32>();
-    /// Bytes of memory for each open track (track that may continue). The list of tracks is counted twice, because it
-    /// is copied when it grows.
+    /// Bytes of memory for each open track (Gaussian followed through frames, which may continue). The list of tracks
+    /// is counted twice, because it is copied when it grows.
     pub const BYTES_PER_TRACK: usize =
         2 * size_of::<OpenTrack>() + 2 * size_of::<u32>() + MAX_CANDIDATES * size_of::<Candidate>() + size_of::<f32>();
 
-    /// Returns the number of open tracks: tracks that may still continue.
+    /// Returns the number of open tracks: tracks (Gaussians followed through frames) that may still continue.
     pub fn open_track_count(&self) -> usize {
         self.tracks.len()
     }
 
-    /// Returns the tracks that may still continue, in the order of their numbers.
+    /// Returns the tracks (Gaussians followed through frames) that may still continue, in the order of their numbers.
     pub(super) fn open_tracks(&self) -> &[OpenTrack] {
         &self.tracks
     }
 
-    /// Returns the number of tracks that have begun so far, including those that have ended.
+    /// Returns the number of tracks (Gaussians followed through frames) that have begun so far, including those that
+    /// have ended.
     pub fn track_count(&self) -> u32 {
         self.born
     }
 
-    /// Links the Gaussians of the next frame, `state`, to tracks. Returns the track of every Gaussian, and how the
-    /// frame was linked. The result does not depend on the number of threads.
+    /// Links the Gaussians of the next frame, `state`, to tracks (Gaussians followed through frames). Returns the track
+    /// of every Gaussian, and how many Gaussians were linked. The result does not depend on the number of threads.
     pub fn link(&mut self, state: &Gaussians) -> FrameLinks {
         let appearances = ComparedAppearance::all_from_state(state);
         let mut links = Links {
@@ -96,10 +100,13 @@ impl Linker {
         FrameLinks { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
-    /// Advances the open tracks by a frame, whose Gaussians have the given `appearances` and `links` to tracks. Returns
-    /// the number of the track of every Gaussian. Each Gaussian without a link begins a track. `in_doubt` lists the
-    /// Gaussians whose link was removed because it was probably wrong; the tracks that they begin are marked
-    /// ([`OpenTrack::is_in_doubt`]).
+    /// Advances the open tracks (Gaussians followed through frames) by a frame. Returns the number of the track of
+    /// every Gaussian; each Gaussian without a link begins a track.
+    ///
+    /// - `links`: links between the open tracks and the Gaussians of the frame.
+    /// - `appearances`: appearance of every Gaussian of the frame.
+    /// - `in_doubt`: Gaussians whose link was removed because it was probably wrong. The tracks that they begin are
+    ///   marked ([`OpenTrack::is_in_doubt`]).
     fn extend_tracks(&mut self, links: &Links, appearances: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
         let mut track_numbers = vec![NONE; appearances.len()];
         let born = self.born;
@@ -127,9 +134,10 @@ impl Linker {
         track_numbers
     }
 
-    /// Returns the indices in `tracks` of the tracks that have been succeeded: another Gaussian has taken the place of
-    /// the track's Gaussian. `links` leaves such a track without a Gaussian for the first time, although a similar
-    /// Gaussian is at the track's expected position. `appearances` holds the appearances of all Gaussians of the frame.
+    /// Finds the open tracks (Gaussians followed through frames) whose Gaussian another Gaussian has replaced, and
+    /// returns their indices in `tracks`. `links` gives such a track no Gaussian in this frame although it had one in
+    /// the previous frame, and a similar Gaussian is at the track's expected position. `appearances` holds the
+    /// appearances of all Gaussians of the frame.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

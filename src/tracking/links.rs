@@ -6,10 +6,11 @@ use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
 use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Maximum number of passes over all tracks in which tracks exchange their Gaussians to lower the costs of links.
+/// Maximum number of passes over all tracks (Gaussians followed through frames) in which tracks exchange their
+/// Gaussians to lower the costs (distance and difference in appearance) of links.
 const MAX_EXCHANGES: usize = 4;
 
-/// Links between the open tracks and the Gaussians of a frame, in both directions.
+/// Links between the open tracks (Gaussians followed through frames) and the Gaussians of a frame, in both directions.
 pub(super) struct Links {
     /// For every open track the Gaussian that continues it; `NONE` if there is none. `track_of_gaussian` holds the
     /// inverse: for every Gaussian the track that it continues.
@@ -26,7 +27,8 @@ impl Links {
         (self.gaussian_of_track[track as usize], self.track_of_gaussian[gaussian as usize]) = (gaussian, track);
     }
 
-    /// Removes the link of the open track `track` and returns the Gaussian that it was linked to.
+    /// Removes the link of the open track `track` (Gaussian followed through frames) and returns the Gaussian that it
+    /// was linked to.
     pub(super) fn undo(&mut self, track: u32) -> u32 {
         let gaussian = std::mem::replace(&mut self.gaussian_of_track[track as usize], NONE);
         self.track_of_gaussian[gaussian as usize] = NONE;
@@ -37,8 +39,8 @@ impl Links {
         self.gaussian_of_track[track as usize] == NONE && self.track_of_gaussian[gaussian as usize] == NONE
     }
 
-    /// Links each track to the first Gaussian, among those not linked yet, that equals the track's last Gaussian bit by
-    /// bit. Goes through `tracks` and the Gaussians (`appearances`) in order.
+    /// Links each track (Gaussian followed through frames) to the first Gaussian, among those not linked yet, that
+    /// equals the track's last Gaussian bit by bit. Goes through `tracks` and the Gaussians (`appearances`) in order.
     pub(super) fn add_repeats(&mut self, tracks: &[OpenTrack], appearances: &[ComparedAppearance]) {
         let buckets = (2 * appearances.len()).next_power_of_two();
         let bucket = |appearance: &ComparedAppearance| appearance.bits as usize & (buckets - 1);
@@ -69,8 +71,9 @@ impl Links {
         }
     }
 
-    /// Links tracks and Gaussians that are not linked yet, by the costs and limits of `round`. Returns the tracks that
-    /// took part, each with its candidates (the Gaussians that could continue it).
+    /// Links tracks (Gaussians followed through frames) and Gaussians that are not linked yet, by the costs (distance
+    /// and difference in appearance) and limits of `round`. Returns the tracks that took part, each with its candidates
+    /// (the Gaussians that could continue it).
     pub(super) fn add_round(
         &mut self,
         tracks: &[OpenTrack],
@@ -96,9 +99,10 @@ impl Links {
         candidates_by_track
     }
 
-    /// Exchanges the Gaussians of two tracks wherever that lowers the total cost of their links. Goes through the
-    /// tracks and their candidates (Gaussians that could continue them) in the order of `candidates_by_track`. `cost`
-    /// returns the cost of the link between a track and a Gaussian. Returns whether any exchange was made.
+    /// Exchanges the Gaussians of two tracks (Gaussians followed through frames) wherever that lowers the total cost
+    /// (distance and difference in appearance) of their links. Goes through the tracks and their candidates (Gaussians
+    /// that could continue them) in the order of `candidates_by_track`. `cost` returns the cost of the link between a
+    /// track and a Gaussian. Returns whether any exchange was made.
     fn exchange(&mut self, candidates_by_track: &[(u32, Candidates)], cost: impl Fn(u32, u32) -> f32) -> bool {
         let mut any = false;
         for (track, candidates) in candidates_by_track {
@@ -119,8 +123,9 @@ impl Links {
         any
     }
 
-    /// Links tracks to their candidates (the Gaussians that could continue them) in the order of cost; ties in the
-    /// order of track, then Gaussian. Skips tracks and Gaussians that already have a link.
+    /// Links tracks (Gaussians followed through frames) to their candidates (the Gaussians that could continue them) in
+    /// the order of cost (distance and difference in appearance); ties in the order of track, then Gaussian. Skips
+    /// tracks and Gaussians that already have a link.
     fn link_by_cost(&mut self, candidates_by_track: &[(u32, Candidates)]) {
         let mut best = vec![(f32::INFINITY, NONE); self.track_of_gaussian.len()];
         for (track, candidates) in candidates_by_track {

@@ -21,7 +21,7 @@ pub(super) struct SlowLinker {
     pub(super) born: u32,
 }
 
-/// Track that may still continue.
+/// Track (Gaussian followed through frames) that may still continue.
 struct SlowTrack {
     number: u32,
     frames_since_seen: f64,
@@ -88,8 +88,9 @@ fn is_near_duplicate(a: &SeenGaussian, b: &SeenGaussian) -> bool {
 }
 
 impl SlowTrack {
-    /// Returns the cost of linking the track to the Gaussian `b`. `r` scales the distance from the expected position,
-    /// `q` the difference in appearance. A link is possible if the cost is at most 1.
+    /// Returns the cost of linking this track (Gaussian followed through frames) to the Gaussian `b`: distance plus
+    /// difference in appearance. `r` scales the distance from the expected position, `q` the difference in appearance.
+    /// A link is possible if the cost is at most 1.
     fn cost(&self, b: &SeenGaussian, r: f64, q: f64) -> f64 {
         let v = self.velocity.unwrap_or_default();
         let speed = v.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -101,15 +102,16 @@ impl SlowTrack {
 }
 
 impl SlowLinker {
-    /// Returns the pair (probability that the link is wrong, track) for every track that a round has linked.
+    /// Computes, for every track (Gaussian followed through frames) that a round of linking has linked, the probability
+    /// that its link is wrong. Returns pairs (probability, track).
     ///
     /// - `candidates`: all possible links of the round as (cost, track, Gaussian).
     /// - `gaussian_of`: the Gaussian of every linked track.
     /// - `taken`: the track of every linked Gaussian.
-    /// - `cost`: returns the cost of a link between a track and a Gaussian.
-    /// - `are_duplicates`: gets the track and the Gaussian of a candidate, then the Gaussian that the track is linked
-    ///   to and the track that the Gaussian is linked to, if any. Returns whether the candidate is no rival because of
-    ///   near-duplicates.
+    /// - `cost`: returns the cost (distance and difference in appearance) of the link between a track and a Gaussian.
+    /// - `are_duplicates`: decides whether a possible link between a track and a Gaussian is ignored because
+    ///   near-duplicates cannot be told apart. Arguments: this track, this Gaussian, the Gaussian that the track is
+    ///   really linked to, and the track that the Gaussian is really linked to.
     fn probabilities(
         candidates: &[(f64, usize, usize)],
         gaussian_of: &BTreeMap<usize, usize>,
@@ -144,7 +146,8 @@ impl SlowLinker {
         linked.iter().map(probability).collect()
     }
 
-    /// Links the next frame and returns the number of the track of every Gaussian.
+    /// Links the Gaussians of the next frame to tracks (Gaussians followed through frames) and returns the number of
+    /// the track of every Gaussian.
     pub(super) fn link(&mut self, state: &Gaussians) -> Vec<u32> {
         let all: Vec<SeenGaussian> = (0..state.len()).map(|i| seen(state, i)).collect();
         let mut gaussian_of: BTreeMap<usize, usize> = BTreeMap::new();
@@ -209,8 +212,8 @@ impl SlowLinker {
         self.extend_tracks(&all, &gaussian_of)
     }
 
-    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian. `gaussian_of` maps
-    /// each linked track to its Gaussian; all other Gaussians begin tracks.
+    /// Advances the open tracks (Gaussians followed through frames) by a frame and returns the number of the track of
+    /// every Gaussian. `gaussian_of` maps each linked track to its Gaussian; all other Gaussians begin tracks.
     fn extend_tracks(&mut self, all: &[SeenGaussian], gaussian_of: &BTreeMap<usize, usize>) -> Vec<u32> {
         let mut numbers = vec![u32::MAX; all.len()];
         for (a, track) in self.tracks.iter_mut().enumerate() {
@@ -251,11 +254,13 @@ impl SlowLinker {
     }
 }
 
-/// For each track a map from each frame in which it was seen to its Gaussian at that frame.
+/// All tracks (Gaussians followed through frames). The map of a track has an entry for each frame in which the track
+/// has a Gaussian: frame → this Gaussian.
 pub(super) type History = Vec<BTreeMap<usize, SeenGaussian>>;
 
-/// Returns the position of a track at `frame`, observed or extrapolated, in scene units, and the number of frames since
-/// the track was last seen. `frame` must not be before the first frame of the track.
+/// Returns the position of a track (Gaussian followed through frames) at `frame`, observed or extrapolated, in scene
+/// units, and the number of frames since the track was last seen. `frame` must not be before the first frame of the
+/// track.
 fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3], usize) {
     let seen: Vec<(&usize, &SeenGaussian)> = track.range(..=frame).collect();
     let mut velocity: Option<[f64; 3]> = None;
@@ -269,17 +274,21 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
     (std::array::from_fn(|c| at.position[c] + (frame - last) as f64 * v[c]), frame - last)
 }
 
-/// Pairs of a track and an earlier track. Key: number of the later track, and bits of the cost of the pair. Value:
-/// number of the earlier track, number of frames in which both tracks were present, whether both tracks are close, and
-/// whether the earlier track has ended.
+/// Pairs of a later and an earlier track (Gaussians followed through frames), sorted by later track and cost (distance
+/// and difference in appearance).
+///
+/// - Key: number of the later track, then the bits of the cost of the pair.
+/// - Value: number of the earlier track; count of shared frames (a frame with both tracks adds 1, a frame without one
+///   of them subtracts 1, down to 0); whether both tracks are close; whether the earlier track has ended.
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
-/// Joins tracks that belong to the same Gaussian: one track ends where and when a similar one begins. Returns for every
-/// track the number of its joined track.
+/// Joins tracks (Gaussians followed through frames) that belong to one Gaussian: one track ends where and when a
+/// similar one begins. Returns for every track the number of its joined track.
 ///
-/// - `in_doubt`: tracks that began because a link was probably wrong.
-/// - `succeeded`: (frame, track) of every track that is missing in the frame although a similar Gaussian is in its
-///   place.
+/// - `in_doubt`: numbers of the tracks that began because a link was probably wrong.
+/// - `succeeded`: pairs (frame, track). The track has no Gaussian in this frame, and another Gaussian has replaced its
+///   Gaussian: a similar one is at the expected position.
+/// - `frames`: number of frames.
 /// - `r` and `q`: in the cost of a pair, `r` scales the distance and `q` the difference in appearance.
 pub(super) fn slow_joined_tracks(
     tracks: &History,
@@ -358,8 +367,11 @@ pub(super) fn slow_joined_tracks(
     joined
 }
 
-/// Finds the cheapest pair of each later track in `pairs`. Joins the two tracks of this pair if the earlier one has
-/// ended, and repeats this until nothing changes. `predecessor` and `has_successor` record the joins of each track.
+/// Joins pairs of tracks (Gaussians followed through frames) that seem to be one Gaussian, until `pairs` has no
+/// joinable pair left. A pair has an earlier and a later track (the one that begins later), and a cost (distance and
+/// difference in appearance; lower is more alike). A later track is joined only by its pair of lowest cost, and only if
+/// the earlier track of this pair has ended. The joins are recorded: `predecessor` holds for each track the earlier
+/// track that it continues, and `has_successor` whether a later track continues it.
 fn join_ended(pairs: &mut TrackPairs, predecessor: &mut [Option<usize>], has_successor: &mut [bool]) {
     loop {
         let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();

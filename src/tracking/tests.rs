@@ -25,8 +25,8 @@ impl UniformNumbers {
     }
 }
 
-/// Returns `count` random Gaussians in a cube of side 1. Their scales vary around a size such that a cube of twice this
-/// size holds about `crowd` Gaussians.
+/// Returns `count` random Gaussians in a cube of side 1, with scales that vary around a common size. The size follows
+/// from `crowd`: a cube with a side of twice this size holds about `crowd` Gaussians.
 fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = Gaussians::zeros(count, 1);
     let size = (crowd / count as f32).cbrt() * 0.5;
@@ -269,9 +269,12 @@ fn kept_order_is_told_from_shuffled_order() {
     assert!(compare_order(&Gaussians::zeros(0, 0), &Gaussians::zeros(0, 0)).is_common);
 }
 
-/// Returns frames of `cloud`, with the index of each Gaussian. Each Gaussian is visible in periods of `shortest` to
-/// `shortest` + 4 frames. After a period it fades out over `overlap` frames, while the next period fades in. Colors
-/// vary by `tint` between periods. After one period in seven there is a gap.
+/// Returns `frames` frames of `cloud`. Each frame is a pair: its Gaussians in random order, and their indices in
+/// `cloud`.
+///
+/// Each Gaussian is visible in periods of `shortest` to `shortest` + 4 frames. After a period it fades out over
+/// `overlap` frames, while the next period fades in. After one period in seven there is a gap. Colors vary by `tint`
+/// between periods.
 fn fading_frames(
     cloud: &Gaussians,
     frames: usize,

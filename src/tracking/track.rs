@@ -3,33 +3,34 @@
 use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
 
-/// Maximum number of Gaussians that are considered as the continuation of a track.
+/// Maximum number of Gaussians that are considered as the continuation of a track (Gaussian followed through frames).
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Limit on how much the speed of a track enlarges the unit of distance in the cost of its links, as a multiple of the
-/// size of the track's Gaussian.
+/// Limit of the part of the distance unit that grows with the speed of a track (Gaussian followed through frames), as a
+/// multiple of the size of its Gaussian. The distance unit is the length by which distances are divided in the cost of
+/// a link.
 const MAX_SPEED_UNITS: f32 = 3.0;
-/// Number that stands for no track, or no Gaussian.
+/// Number that stands for no track (Gaussian followed through frames), or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// Rounds of linking, in order. Each round links only tracks and Gaussians that the previous rounds left without a
-/// link.
+/// Rounds of linking, in order. Each round links only tracks (Gaussians followed through frames) and Gaussians that the
+/// previous rounds left without a link.
 pub(super) const ROUNDS: [Round; 3] = [
     Round { reach: 0.25, strictness: 4.0, includes_missing: false },
     Round { reach: 1.0, strictness: 1.0, includes_missing: true },
     Round { reach: 4.0, strictness: 4.0, includes_missing: true },
 ];
 
-/// Parameters of a round of linking. A link is possible if its cost is at most 1; in this cost, `reach` scales the
-/// distance and `strictness` the difference in appearance. `includes_missing` states whether tracks without a Gaussian
-/// in the previous frame take part.
+/// Parameters of a round of linking tracks (Gaussians followed through frames) to Gaussians. A link is possible if its
+/// cost is at most 1; in this cost, `reach` scales the distance and `strictness` the difference in appearance.
+/// `includes_missing` states whether tracks without a Gaussian in the previous frame take part.
 pub(super) struct Round {
     pub(super) reach: f32,
     pub(super) strictness: f32,
     pub(super) includes_missing: bool,
 }
 
-/// Track that may still continue: it had a Gaussian in the frame that was linked last or in one of the
-/// [`MAX_GAP_FRAMES`](super::MAX_GAP_FRAMES) frames before that.
+/// Track (Gaussian followed through frames) that may still continue: it had a Gaussian in the frame that was linked
+/// last or in one of the [`MAX_GAP_FRAMES`](super::MAX_GAP_FRAMES) frames before that.
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {
     pub(super) number: u32,
@@ -47,7 +48,8 @@ pub(super) struct OpenTrack {
     pub(super) is_succeeded: bool,
 }
 
-/// Gaussian that may continue a track, and the cost of the link between the track and it.
+/// Gaussian that may continue a track (Gaussian followed through frames), and the cost of the link between the track
+/// and it: distance and difference in appearance.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) struct Candidate {
     pub(super) cost: f32,
@@ -55,12 +57,13 @@ pub(super) struct Candidate {
 }
 
 impl OpenTrack {
-    /// Creates the track `number`, which begins with a Gaussian of this appearance.
+    /// Creates the track (Gaussian followed through frames) with the number `number`, which begins with a Gaussian of
+    /// this appearance.
     pub(super) fn new(number: u32, appearance: ComparedAppearance) -> OpenTrack {
         OpenTrack { number, frames_since_seen: 1, velocity: None, appearance, is_in_doubt: false, is_succeeded: false }
     }
 
-    /// Returns the position where the track's Gaussian is expected in the next frame, scene units.
+    /// Returns the position where the Gaussian of this track is expected in the next frame, scene units.
     pub(super) fn expected_position(&self) -> [f32; 3] {
         let velocity = self.velocity.unwrap_or_default();
         std::array::from_fn(|c| self.appearance.position[c] + self.frames_since_seen as f32 * velocity[c])
@@ -73,8 +76,9 @@ impl OpenTrack {
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
     }
 
-    /// Returns the cost, by the rules of `round`, of linking the track to a Gaussian of this appearance; if it is above
-    /// 1, a link is impossible. If the distance term alone exceeds 1, returns only this term.
+    /// Returns the cost of linking the track to a Gaussian with the appearance `appearance`: the squared distance from
+    /// the expected position plus the difference in appearance, both scaled by `round`. A link is possible only if the
+    /// cost is at most 1. If the term for the distance alone exceeds 1, returns only this term.
     pub(super) fn cost(&self, appearance: &ComparedAppearance, round: &Round) -> f32 {
         self.cost_at(appearance, self.expected_position(), round.reach * self.distance_unit(), round.strictness)
     }
@@ -86,15 +90,15 @@ impl OpenTrack {
         if distance > 1.0 { distance } else { distance + strictness * self.appearance.difference(appearance) }
     }
 
-    /// Returns the position of the track's Gaussian in the frame that was linked last: observed, or extrapolated if it
-    /// was missing there.
+    /// Returns the position of this track's Gaussian in the frame that was linked last, scene units. The position is
+    /// extrapolated by the velocity of the track if the track has no Gaussian in that frame.
     pub(super) fn current_position(&self) -> [f32; 3] {
         let velocity = self.velocity.unwrap_or_default();
         std::array::from_fn(|c| self.appearance.position[c] + (self.frames_since_seen - 1) as f32 * velocity[c])
     }
 
-    /// Continues the track with a Gaussian of the next frame, which has the appearance `appearance`, and updates the
-    /// track's velocity.
+    /// Continues the track (Gaussian followed through frames) with a Gaussian of the next frame, which has the
+    /// appearance `appearance`, and updates the track's velocity.
     pub(super) fn extend(&mut self, appearance: ComparedAppearance) {
         let step: [f32; 3] = std::array::from_fn(|c| {
             (appearance.position[c] - self.appearance.position[c]) / self.frames_since_seen as f32
@@ -106,8 +110,9 @@ impl OpenTrack {
         (self.appearance, self.frames_since_seen, self.is_succeeded) = (appearance, 1, false);
     }
 
-    /// Returns the Gaussians in `grid` that may continue the track, because their cost by the rules of `round` is at
-    /// most 1.
+    /// Returns the Gaussians in `grid` that may continue the track (Gaussian followed through frames): up to
+    /// [`MAX_CANDIDATES`], with the lowest costs (distance and difference in appearance) by the rules of `round`.
+    /// Gaussians with a cost above 1 are left out.
     pub(super) fn candidates(&self, grid: &CellGrid, round: &Round) -> Candidates {
         let mut candidates = Candidates::default();
         let (expected, distance_unit) = (self.expected_position(), round.reach * self.distance_unit());
@@ -118,7 +123,8 @@ impl OpenTrack {
     }
 }
 
-/// Gaussians that may continue a track, at most [`MAX_CANDIDATES`]: those with the lowest costs, in the order of cost.
+/// Gaussians that may continue a track (Gaussian followed through frames), at most [`MAX_CANDIDATES`]: those with the
+/// lowest costs (distance and difference in appearance), in the order of cost.
 pub(super) struct Candidates {
     best: [Candidate; MAX_CANDIDATES],
 }
@@ -130,8 +136,8 @@ impl Default for Candidates {
 }
 
 impl Candidates {
-    /// Adds the Gaussian with the number `gaussian` to the candidates if its cost is at most 1 and among the
-    /// [`MAX_CANDIDATES`] lowest costs so far.
+    /// Adds the Gaussian with the number `gaussian` to the candidates if its cost (distance and difference in
+    /// appearance) is at most 1 and among the [`MAX_CANDIDATES`] lowest costs so far.
     pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
             self.add(Candidate { cost, gaussian });

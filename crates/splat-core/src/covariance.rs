@@ -1,4 +1,4 @@
-//! Scales and rotation that are computed from a covariance matrix.
+//! Computes the scales and the rotation of a Gaussian from its covariance matrix.
 //!
 //! Most model formats store scales S and a rotation R, which define the covariance Σ = R S Sᵀ Rᵀ. Some formats define Σ
 //! in another way: with a quaternion that is not of unit length, or as a slice through a four-dimensional Gaussian.

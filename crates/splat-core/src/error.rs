@@ -95,8 +95,12 @@ impl ErrorKind {
         }
     }
 
-    /// Returns the kind of failure of a failed system call. It is an input error if `action` begins with a verb of
-    /// reading, such as "open" or "list". Otherwise, and for the action "read back", it is an output error.
+    /// Returns the kind of the error that a failed system call causes. `action` is the attempted operation, as a phrase
+    /// for the message that begins with a verb ("open", "create a folder in"):
+    ///
+    /// - verb of reading, such as "open" or "list": input error;
+    /// - any other verb: output error;
+    /// - the action "read back", which reads a file that this run wrote: output error.
     fn from_action(action: &str) -> ErrorKind {
         const READING: [&str; 7] = ["open", "read", "list", "find", "map", "examine", "decompress"];
         let verb = action.split(' ').next().unwrap_or_default();

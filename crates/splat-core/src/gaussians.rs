@@ -51,7 +51,7 @@ impl AttributeValues {
         self.data.resize(self.width * len, 0.0);
     }
 
-    /// Keeps the first `width` components of every Gaussian and drops the others.
+    /// Drops all components of the attribute but the first `width` ones, for every Gaussian.
     fn narrow(&mut self, width: usize) {
         self.width = width;
         self.data.truncate(width * self.len);
@@ -217,8 +217,8 @@ impl Gaussians {
 }
 
 bitflags! {
-    /// Set of attributes. The bits are in storage order and are part of the frame stream format, so they must not
-    /// change.
+    /// Set of attributes. The bits are in storage order. They are part of the format in which other programs stream
+    /// frames to the standard input of splatsieve, so they must not change.
     #[derive(Debug, Clone, Copy, PartialEq, Eq)]
     pub struct Attributes: u32 {
         /// Position of the center.

@@ -127,11 +127,12 @@ impl<'a> GradientSpan<'a> {
         &mut self.planes[column.bits().trailing_zeros() as usize]
     }
 
-    /// Adds one value of `terms` to the derivative of each Gaussian from index `first` on, in the order of the
-    /// Gaussians. The derivative is with respect to component `component` of the single attribute `column`.
+    /// Adds `terms` to the derivatives with respect to component `component` of the single attribute `column`: term k
+    /// to the derivative of Gaussian `first` + k.
     ///
-    /// Does nothing if the attribute or component is not differentiated. Skips a value that is not finite or whose
-    /// addition would overflow f32. Ignores values for Gaussians beyond the span.
+    /// - Does nothing if the attribute or the component is not differentiated.
+    /// - Skips a term that is not finite, or whose addition would overflow f32.
+    /// - Ignores terms for Gaussians beyond the end of the span.
     ///
     /// # Panics
     /// Panics if `first` lies before the span, or more than one index after its last Gaussian.

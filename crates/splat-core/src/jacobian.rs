@@ -6,9 +6,11 @@ use super::{AttributeValues, Attributes, Gaussians, Gradients};
 /// are the attributes in the model file. Each attribute of the state depends only on the stored values of the same
 /// attribute.
 ///
-/// The derivative of an attribute of w components has one of three forms. Without planes, it is the identity: state and
-/// stored values change by the same amount. With one plane, each Gaussian has one factor for all components. With w²
-/// planes, plane `i·w + j` is ∂ state component i / ∂ stored component j.
+/// The derivative of an attribute of w components has one of three forms, by its number of planes:
+///
+/// - no planes: the identity; state and stored values change by the same amount;
+/// - one plane: each Gaussian has one factor for all components;
+/// - w² planes: plane `i·w + j` is ∂ state component i / ∂ stored component j.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Jacobian {
     columns: [AttributeValues; 5],
@@ -77,8 +79,8 @@ impl Jacobian {
         whole
     }
 
-    /// Adds to the attributes `state` at the frame their first-order change, ∂state/∂stored · `change`. `change` is the
-    /// change of the stored attributes.
+    /// Adds ∂state/∂stored · `change` to `state`. `change` is the change of the stored attributes, `state` holds the
+    /// attributes at the frame, and the added product is their change to first order.
     ///
     /// Skips attributes for which `change` is empty. If `change` has a lower SH degree than `state`, the higher SH
     /// coefficients stay unchanged.

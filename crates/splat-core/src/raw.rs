@@ -1,4 +1,4 @@
-//! Stored parameters of a model format that computes every frame from them.
+//! Stored parameters of Gaussians in a model format that computes the attributes at every frame from them.
 
 use serde::{Deserialize, Serialize};
 
@@ -47,7 +47,7 @@ impl StoredParams {
 }
 
 impl From<Gaussians> for StoredParams {
-    /// Creates the stored parameters of a model format that stores only the attributes of `gaussians`.
+    /// Creates the stored parameters of a model format that has no parameters besides the attributes `gaussians`.
     fn from(gaussians: Gaussians) -> StoredParams {
         let own = AttributeValues::zeros(0, gaussians.len());
         StoredParams { gaussians, format_specific: own }

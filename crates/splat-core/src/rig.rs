@@ -94,8 +94,11 @@ impl Rig {
     }
 
     /// Returns the maximum allowed difference between the time of a view and the time of its frame, in the unit of the
-    /// times: 1e-6 times the time span of the views, or 1e-6 if they have fewer than two distinct times. The sequence
-    /// is assumed to cover the same time span as the views.
+    /// times.
+    ///
+    /// - Views of two or more distinct times: 1e-6 times the time span of the views. The sequence is assumed to cover
+    ///   the same time span.
+    /// - Otherwise: 1e-6.
     pub fn time_tolerance(&self) -> f64 {
         let times = self.times();
         TIME_TOLERANCE * if times.len() > 1 { span(&times) } else { 1.0 }
@@ -150,8 +153,8 @@ impl Rig {
             .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))
     }
 
-    /// Returns the path of the photograph of the view `picture`, if the camera file names one. `frame_times` are the
-    /// increasing times of the frames.
+    /// Returns the path of the photograph that belongs to `picture` (a camera at a frame). Returns `None` if the camera
+    /// file names no photograph for it. `frame_times` are the increasing times of the frames.
     pub fn image_path(&self, picture: FrameView, frame_times: &[f64]) -> Option<&Path> {
         let shows = |shot: &&Shot| {
             let frame = || self.frame_of(shot, frame_times).ok();

@@ -28,31 +28,32 @@ bitflags! {
 /// [`StatisticRows`] that holds its values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Statistic {
-    /// Trajectory magnitude, see [`StatisticRows::d`].
+    /// Trajectory magnitude: root mean square of the distance moved from frame to frame ([`StatisticRows::d`]).
     D,
-    /// Curvature of the trajectory, see [`StatisticRows::kappa`].
+    /// Curvature of the trajectory: mean change of the velocity from frame to frame ([`StatisticRows::kappa`]).
     Kappa,
     /// Variance of the opacity over time, see [`StatisticRows::v`].
     V,
     /// Number of frames in which the opacity reaches a threshold, see [`StatisticRows::life`].
     Life,
-    /// Mean contribution to a render, see [`StatisticRows::c`].
+    /// Mean contribution to a render in pixels: visible weight or projected area ([`StatisticRows::c`]).
     C,
-    /// Anisotropy of the scales, see [`StatisticRows::e`].
+    /// Anisotropy: how long the longest axis of the Gaussian is compared with its other axes ([`StatisticRows::e`]).
     E,
-    /// Fraction of the views that the Gaussian touches, see [`StatisticRows::vis`].
+    /// Fraction of the (frame, view) pairs in which the Gaussian is alive and touches the image
+    /// ([`StatisticRows::vis`]).
     Vis,
-    /// Largest blending weight in any pixel, see [`StatisticRows::w`].
+    /// Largest blending weight (alpha · transmittance) of the Gaussian in any pixel ([`StatisticRows::w`]).
     W,
 }
 
-/// Functions that return the array of a statistic from [`StatisticRows`], the first for reading and the second for
-/// writing.
+/// Access to the array of one statistic in [`StatisticRows`]: two functions that return this array, the first for
+/// reading and the second for writing.
 #[derive(Debug, Clone, Copy)]
 pub enum StatisticArray {
-    /// Statistic whose values are real numbers.
+    /// Functions for a statistic whose values are real numbers: the array for reading, the array for writing.
     F64(fn(&StatisticRows) -> &Vec<f64>, fn(&mut StatisticRows) -> &mut Vec<f64>),
-    /// Statistic whose values are numbers of frames.
+    /// Functions for a statistic whose values are numbers of frames: the array for reading, the array for writing.
     U32(fn(&StatisticRows) -> &Vec<u32>, fn(&mut StatisticRows) -> &mut Vec<u32>),
 }
 

@@ -61,8 +61,9 @@ impl ViewSchedule {
         self.frames += count;
     }
 
-    /// Returns the bytes of memory that a schedule of `runs` runs with at most `views` views per frame takes. The bytes
-    /// of the entries are doubled, because growing vectors reserve up to twice their length.
+    /// Returns the bytes of memory that a schedule takes, for `runs` runs (consecutive frames with equal views) with at
+    /// most `views` views each. The bytes of the entries are doubled, because a growing vector reserves up to twice its
+    /// length.
     pub const fn bytes(runs: u64, views: u64) -> u64 {
         2 * runs * (size_of::<ViewRun>() as u64 + views * size_of::<(u32, u32)>() as u64)
     }
@@ -104,7 +105,8 @@ impl ViewSchedule {
         used
     }
 
-    /// Returns the views that every frame of the run `run` has, as pairs (view number, camera index).
+    /// Returns the views of the run with the index `run` (consecutive frames with equal views), as pairs (view number,
+    /// camera index).
     fn views_of_run(&self, run: usize) -> &[(u32, u32)] {
         let end = self.runs.get(run + 1).map_or(self.views.len(), |next| next.view);
         &self.views[self.runs[run].view..end]

@@ -14,7 +14,7 @@ pub struct Deltas {
     pub delta: Gaussians,
     /// Mask (factor on the stored attributes) of each Gaussian; `None` if every mask is 1.
     pub mask: Option<Vec<f32>>,
-    /// Attributes for which deltas were requested and which the field changes.
+    /// Attributes that have deltas: those that were requested and that the field changes.
     pub active: Attributes,
     /// Whether the rotation delta multiplies the stored quaternion instead of being added.
     pub multiply_rotation: bool,
@@ -32,8 +32,8 @@ impl Deltas {
         }
     }
 
-    /// Resizes the deltas of the `active` attributes to `rows` Gaussians, so that new deltas can be written. Sets the
-    /// fields [`Deltas::active`] and [`Deltas::multiply_rotation`] to the arguments.
+    /// Prepares these deltas for writing: resizes the deltas of the `active` attributes to `rows` Gaussians, and sets
+    /// the fields [`Deltas::active`] and [`Deltas::multiply_rotation`] to the arguments.
     pub(super) fn begin(&mut self, rows: usize, active: Attributes, multiply_rotation: bool) {
         for column in active.iter() {
             self.delta.column_mut(column).resize(rows);
@@ -42,8 +42,8 @@ impl Deltas {
         self.multiply_rotation = multiply_rotation;
     }
 
-    /// Applies the deltas and masks to the stored attributes `raw` and writes the result to `state`, for the attributes
-    /// `want` only. Resizes these attributes of `state`.
+    /// Applies the deltas and masks (factors on the stored attributes of each Gaussian) to the stored attributes `raw`
+    /// and writes the result to `state`, for the attributes `want` only. Resizes these attributes of `state`.
     pub fn apply(&self, raw: &Gaussians, want: Attributes, state: &mut Gaussians) {
         for column in want.iter() {
             let from = raw.column(column);
@@ -69,11 +69,11 @@ impl Deltas {
         }
     }
 
-    /// Computes into `out` the derivative ∂state/∂raw of the resulting attributes with respect to the stored ones, with
-    /// deltas and masks held constant.
+    /// Computes into `out` the derivative ∂state/∂raw of [`Deltas::apply`]: raw are the stored attributes, and the
+    /// state is its result. Deltas and masks (factors on the stored attributes) are held constant.
     ///
-    /// Attributes for which this derivative is the identity get no values. Values that are not finite become 0.
-    /// `rotation` holds the stored quaternions.
+    /// An attribute whose derivative is the identity gets no values. Values that are not finite become 0. `rotation`
+    /// holds the stored quaternions.
     pub(super) fn jacobian(&self, rotation: &AttributeValues, out: &mut Jacobian) {
         for column in self.active.iter() {
             if column == Attributes::ROTATION && self.multiply_rotation {
@@ -94,8 +94,8 @@ impl Deltas {
         }
     }
 
-    /// Computes the stored attributes `raw` that these deltas and masks turn into `state`, for the attributes `want`.
-    /// This is the inverse of [`Deltas::apply`].
+    /// Computes into `raw` the stored attributes that these deltas and masks (factors on stored attributes) turn into
+    /// `state`, for the attributes `want`. This is the inverse of [`Deltas::apply`].
     ///
     /// The result is exact up to rounding, except for the length of quaternions. If a mask or a rotation delta is zero,
     /// no stored value leads to `state`, and the result is not finite.
@@ -147,8 +147,9 @@ pub(super) fn finite(x: f32) -> f32 {
     if x.is_finite() { x } else { 0.0 }
 }
 
-/// Applies the chain rule to the normalized quaternion product u = `a` ⊗ `b` / ‖`a` ⊗ `b`‖. Returns the derivative of a
-/// value with respect to `a`; `by_unit` is its derivative with respect to u. Returns 0 if the product is zero.
+/// Computes a derivative through the normalized quaternion product u = `a` ⊗ `b` / ‖`a` ⊗ `b`‖ by the chain rule.
+/// `by_unit` is the derivative of some value with respect to u; returns the derivative of this value with respect to
+/// `a`. Returns 0 if the product is zero.
 fn unit_product_gradient(a: [f32; 4], b: [f32; 4], by_unit: [f32; 4]) -> [f32; 4] {
     let whole = product(a, b);
     let length = whole.iter().map(|x| x * x).sum::<f32>().sqrt();

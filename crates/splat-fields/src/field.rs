@@ -24,17 +24,19 @@ pub struct FieldConfig {
     /// Attributes that the field changes. In training, one option per attribute turns its head (output MLP) off:
     /// `no_dx`, `no_ds`, `no_dr`, `no_do` or `no_dshs`. This set contains the attributes whose option is false.
     pub deformed_attributes: Attributes,
-    /// Whether an additional head (output MLP) computes a mask, a factor on the stored attributes of each Gaussian. If
-    /// true, `empty_voxel` is ignored.
+    /// Whether the field computes a mask (a factor on the stored attributes of each Gaussian) with an additional head
+    /// (output MLP). If true, `empty_voxel` is ignored.
     pub static_mlp: bool,
-    /// Whether a voxel grid contains the mask, a factor on the stored attributes of each Gaussian.
+    /// Whether the field reads a mask (a factor on the stored attributes of each Gaussian) from a grid of voxels in
+    /// space, at the stored position of the Gaussian.
     pub empty_voxel: bool,
     /// Frequency p of an encoding of the plane features f. If p is above 1, the trunk reads `[f, sin(p·f), cos(p·f)]`
     /// instead of f.
     pub grid_pe: i64,
     /// Whether the trunk (first MLP) reads `[x, y, z, t]` instead of plane features.
     pub no_grid: bool,
-    /// Whether the stored quaternion is multiplied by the rotation delta instead of adding the delta.
+    /// Whether the rotation at a time is the product of the stored quaternion and the rotation delta. If false, it is
+    /// their sum.
     pub apply_rotation: bool,
 }
 
@@ -43,18 +45,21 @@ pub struct FieldConfig {
 pub(super) enum Mask {
     /// The field has no mask: stored attributes are not multiplied by a factor before the deltas are added.
     None,
-    /// The last head (output MLP) of the field computes the mask, which varies with time (option `static_mlp`).
+    /// The last head (output MLP) of the field computes the mask (factor on stored attributes), which varies with time
+    /// (option `static_mlp`).
     Head,
-    /// A voxel grid contains the mask, which is constant in time (option `empty_voxel`).
+    /// A voxel grid contains the mask (factor on stored attributes), which is constant in time (option `empty_voxel`).
     Voxel(VoxelMask),
 }
 
-/// Small MLP that computes the deltas of one attribute, or the mask (factor on stored attributes), from the output of
-/// the trunk (the MLP shared by all attributes) after ReLU: hidden layer, ReLU, output layer.
+/// Head: small MLP that computes the deltas of one attribute, or the mask (factor on stored attributes).
+///
+/// Its input is the output of the trunk (the MLP shared by all attributes) after ReLU. It consists of a hidden layer,
+/// ReLU and an output layer.
 #[derive(Debug, Clone)]
 pub(super) struct Head {
-    /// Attribute whose deltas the head (output MLP) computes; `None` if it computes the mask of the option
-    /// `static_mlp`.
+    /// Attribute whose deltas the head (output MLP) computes; `None` if it computes the mask (factor on stored
+    /// attributes) of the option `static_mlp`.
     pub(super) column: Option<Attributes>,
     pub(super) hidden: Linear,
     pub(super) output: Linear,
@@ -77,7 +82,8 @@ pub struct Field {
 pub struct PreparedPositions {
     rows: usize,
     input: PreparedInput,
-    /// Mask of each Gaussian from the voxel grid; `None` if the field has no voxel grid.
+    /// Mask of each Gaussian, interpolated in the voxel grid of the field; `None` if the field has no voxel grid. A
+    /// mask is a factor on the stored attributes of the Gaussian, before deltas are added.
     voxel: Option<Vec<f32>>,
 }
 
@@ -96,8 +102,8 @@ pub struct LayerBuffers {
     hidden: Vec<CacheLine>,
 }
 
-/// Returns the name of the head (output MLP) of an attribute in the state dict, and the option in `cfg_args` that turns
-/// this head on.
+/// Returns two texts for an attribute: the name of its head (output MLP) in the state dict, and the option in
+/// `cfg_args` that turns this head on.
 fn head_name(column: Attributes) -> (&'static str, &'static str) {
     match column {
         Attributes::POSITION => ("pos_deform", "no_dx=False"),
@@ -199,9 +205,13 @@ impl Field {
         }
     }
 
-    /// Computes into `out` the deltas and masks of the prepared block at `time`, for the attributes in `want` that the
-    /// field changes. Other attributes of `out` stay unchanged. `time` is passed to the field unscaled; the feature
-    /// planes clamp it to [−1, 1].
+    /// Evaluates the field at `time` for the Gaussians of a prepared block. Writes to `out` the deltas of the
+    /// attributes in `want` that the field changes, and the mask of each Gaussian. The mask is a factor on the stored
+    /// attributes, except the rotation, to which the deltas are then added ([`Deltas`]). Deltas of other attributes in
+    /// `out` stay unchanged.
+    ///
+    /// `prepared` is what [`Field::prepare`] returned for the block. `time` is passed to the field unscaled; the
+    /// feature planes clamp it to [−1, 1].
     ///
     /// # Errors
     /// Fails if `time` is not finite, or if `out` has another SH degree than the field.
@@ -269,8 +279,9 @@ impl Field {
         self.evaluate::<true>(prepared, time, lines, scratch, out);
     }
 
-    /// Evaluates the field into `out`, in groups of [`LANES`] Gaussians. The compiler inlines this function and its
-    /// callees into one copy per instruction set; `FMA` says whether fused multiply-adds are used.
+    /// Evaluates the field at `time` into `out`, in groups of [`LANES`] Gaussians. `lines` are the feature planes with
+    /// a time axis, interpolated at this time; it is empty if the field has no planes. The compiler inlines this
+    /// function and its callees into one copy per instruction set; `FMA` says whether fused multiply-adds are used.
     #[inline(always)]
     fn evaluate<const FMA: bool>(
         &self,
@@ -314,8 +325,8 @@ impl Field {
     }
 }
 
-/// Writes the input `[x, y, z, t]` of the trunk (first MLP) of a field without planes into `features`. `positions`
-/// holds one slice per axis, with one value per Gaussian of a group.
+/// Writes the input of the trunk (first MLP) of a field without planes, `[x, y, z, t]`, to `features` for a group of up
+/// to [`LANES`] Gaussians. `positions` holds the x, y and z values of the group.
 #[inline(always)]
 pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features: &mut Vec<CacheLine>) {
     features.clear();

@@ -36,8 +36,9 @@ impl Field {
     /// returned for these positions. A derivative that is not finite becomes 0;
     /// for a position, whose derivative is I + ∂delta/∂position, this concerns only ∂delta/∂position.
     ///
-    /// If the field has a mask (option `static_mlp` or `empty_voxel`), masks and deltas count as constant: the position
-    /// at `time` then changes by the mask times the change of the stored position.
+    /// If the field has a mask, a factor on the stored attributes (option `static_mlp` or `empty_voxel`), masks and
+    /// deltas count as constant: the position at `time` then changes by the mask times the change of the stored
+    /// position.
     ///
     /// # Errors
     /// Fails if `time` is not finite.
@@ -74,8 +75,9 @@ impl Field {
         Ok(found)
     }
 
-    /// Computes the derivative of the positions at `time` with respect to the stored positions `position`. Plane `3·i +
-    /// j` of the result is ∂ component i / ∂ stored component j.
+    /// Computes the derivative of the positions at `time` with respect to the stored positions `position`. `head` is
+    /// the MLP that computes the position deltas. Plane `3·i + j` of the result is ∂ component i / ∂ stored component
+    /// j.
     fn position_jacobian(&self, head: &Head, position: &AttributeValues, time: f32) -> AttributeValues {
         let mut out = AttributeValues::zeros(9, position.len());
         #[cfg(target_arch = "x86_64")]
@@ -148,7 +150,8 @@ impl Field {
 }
 
 impl JacobianGroup {
-    /// Computes the outputs of all layers of the trunk and of the hidden layer of `head` from the features.
+    /// Evaluates the trunk (MLP shared by all attributes) and the hidden layer of `head` for the plane features of the
+    /// group, and keeps the outputs of all layers for the backward pass.
     #[inline(always)]
     fn forward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
         self.trunk.resize(field.trunk.len(), Vec::new());
@@ -160,8 +163,8 @@ impl JacobianGroup {
         head.hidden.activate::<FMA>(input, &mut self.hidden);
     }
 
-    /// Returns the derivative of a position component with respect to the position along `axis`, by the chain rule: the
-    /// sum over the plane features of `gradient` times `slopes`.
+    /// Returns the derivative of a position component with respect to the position along `axis`. By the chain rule,
+    /// this is the sum over the plane features of ∂component/∂feature (`gradient`) times ∂feature/∂position (`slopes`).
     #[inline(always)]
     fn axis_derivative(&self, axis: usize) -> CacheLine {
         let mut sums = CacheLine([0.0; LANES]);

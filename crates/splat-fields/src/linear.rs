@@ -85,11 +85,11 @@ impl Linear {
     }
 
     /// Computes into `out` the derivatives of a value with respect to the inputs of the layer, from its derivatives
-    /// with respect to the outputs (`output_gradient`).
+    /// with respect to the outputs (`output_gradient`). Both arrays are filled up with zeros to whole panels ([`PANEL`]
+    /// values).
     ///
-    /// Both arrays are filled up with zeros to whole panels ([`PANEL`] values). If the inputs of the layer come out of
-    /// a ReLU, they are passed as `activations`: where they are not positive, the derivative is set to 0. Otherwise
-    /// `activations` is `None`.
+    /// `activations` are the inputs of the layer, if they come out of a ReLU: the derivative of an input that is not
+    /// positive becomes 0. `None` if they do not come out of a ReLU.
     #[inline(always)]
     pub(super) fn backward<const FMA: bool>(
         &self,
@@ -118,8 +118,9 @@ impl Linear {
         }
     }
 
-    /// Computes the outputs of the layer without ReLU for `input`. Writes them for the first `lanes` Gaussians to
-    /// `planes`, which holds `len` values per output: output o begins at index `o·len + start`.
+    /// Computes the outputs of the layer for `input`, without ReLU, and writes those of the first `lanes` Gaussians to
+    /// `planes`. This array holds one plane of `len` values per output. The first Gaussian has index `start` in each
+    /// plane, so the values of output o begin at `o·len + start`.
     #[inline(always)]
     pub(super) fn write<const FMA: bool>(
         &self,
@@ -140,9 +141,12 @@ impl Linear {
     }
 }
 
-/// Computes the outputs of one panel ([`PANEL`] outputs) of a layer. Each sum starts with the bias and adds the inputs
-/// in order, so the result for a Gaussian does not depend on the Gaussians beside it. `FMA` selects fused
-/// multiply-adds. On a processor without these instructions, each fused multiply-add would be a function call.
+/// Computes the outputs of one panel ([`PANEL`] outputs) of a layer from the `input` of the layer, and the `weight` and
+/// `bias` of the panel.
+///
+/// Each sum starts with the bias and adds the inputs in order, so the result for a Gaussian does not depend on the
+/// Gaussians beside it. `FMA` selects fused multiply-adds. On a processor without these instructions, each fused
+/// multiply-add would be a function call.
 #[inline(always)]
 fn sums<const FMA: bool>(input: &[CacheLine], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [CacheLine; PANEL] {
     let mut sums = bias.map(|b| CacheLine([b; LANES]));

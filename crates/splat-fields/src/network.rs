@@ -52,8 +52,8 @@ struct NetworkLayer {
 #[derive(Debug, Clone)]
 struct NetworkHead {
     column: Attributes,
-    /// Index of the first plane of the attribute in [`PredictedMotion`] that the layer computes: 3 for the translation
-    /// part v of a screw motion, otherwise 0.
+    /// Index of the plane of [`PredictedMotion`] at which the outputs of the layer begin: 3 for the translation part v
+    /// of a screw motion, and 0 for everything else.
     plane: usize,
     output: Linear,
 }
@@ -67,8 +67,9 @@ pub struct EncodedPositions {
     values: Vec<CacheLine>,
 }
 
-/// Motion that the network computes for a block of Gaussians: the outputs of its heads. An attribute is empty if the
-/// network has no head for it, or until [`Network::motion`] computes it.
+/// Motion that the network computes for a block of Gaussians at one time: the outputs of its heads (output layers). An
+/// attribute for which the network has no head is empty. All attributes are empty until [`Network::motion`] computes
+/// them.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
     /// Position offset: 3 planes, scene units. If the network predicts screw motions: 6 planes, the rotation part w and
@@ -333,7 +334,8 @@ impl Network {
         }
     }
 
-    /// Returns the encoding of `time` that the layers read. The values are equal for all Gaussians of a group.
+    /// Returns the encoding of `time` that the layers read: the time with its sines and cosines, or the output of the
+    /// time network if there is one. All Gaussians of a group get the same values.
     #[inline(always)]
     fn encode_time<const FMA: bool>(&self, time: f32) -> Vec<CacheLine> {
         let mut now: Vec<CacheLine> =
@@ -347,8 +349,9 @@ impl Network {
         now
     }
 
-    /// Computes into `out` the derivatives of the position outputs with respect to the position. Makes one forward pass
-    /// for all outputs, and one backward pass for each output.
+    /// Computes into `out` the derivatives of the position outputs (offset, or parameters of the screw motion) with
+    /// respect to the stored position, at `time`. Makes one forward pass for all outputs, and one backward pass for
+    /// each output.
     #[inline(always)]
     fn differentiate<const FMA: bool>(&self, encoded: &EncodedPositions, time: f32, out: &mut AttributeValues) {
         let encoded_time = self.encode_time::<FMA>(time);
@@ -412,7 +415,8 @@ fn checked_time(time: f64) -> Result<f32> {
     }
 }
 
-/// Returns the encoding `[v, sin(v), cos(v), sin(2v), cos(2v), …]` of a number.
+/// Returns the encoding `[v, sin(v), cos(v), sin(2v), cos(2v), …]` of a number v. The frequencies are `octaves` powers
+/// of 2, from 1 on.
 fn encode_scalar(value: f32, octaves: usize) -> Vec<f32> {
     let mut all = Vec::with_capacity(1 + 2 * octaves);
     all.push(value);
@@ -443,8 +447,9 @@ fn relu_gradient(gradient: &mut [CacheLine], activations: &[CacheLine]) {
     }
 }
 
-/// Returns the derivative of a network output with respect to the position along `axis`, from its derivatives
-/// `gradient` with respect to the encoded position.
+/// Returns the derivative of a network output with respect to the position along `axis`. `position_encoding` holds the
+/// encoded position (sines and cosines), and `gradient` the derivatives of the output with respect to the encoded
+/// position.
 #[inline(always)]
 fn axis_derivative(axis: usize, position_encoding: &[CacheLine], gradient: &[CacheLine]) -> CacheLine {
     let mut sum = gradient[axis];

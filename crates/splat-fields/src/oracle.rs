@@ -102,8 +102,8 @@ impl Oracle<'_> {
         unreachable!("the loop ends at the first absent level")
     }
 
-    /// Returns the mask (factor on stored attributes) that the voxel grid of the option `empty_voxel` gives at position
-    /// `p`.
+    /// Returns the mask (factor on stored attributes) at position `p`, scene units, by interpolation in the voxel grid
+    /// of the option `empty_voxel`.
     fn voxel_mask(&self, p: &[f64]) -> f64 {
         let (shape, grid) = self.tensor("empty_voxel.grid");
         let (_, low) = self.tensor("empty_voxel.xyz_min");

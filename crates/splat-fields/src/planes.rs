@@ -26,8 +26,8 @@ pub(super) const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3
 /// Numbers of the planes over (x, t), (y, t) and (z, t) in the state dict.
 const TEMPORAL: [usize; 3] = [2, 4, 5];
 
-/// Plane of features over the axes a and b, stored as `[size_b, size_a, channels]`, so that the channels of a texel are
-/// contiguous.
+/// Plane of features over two axes a and b: a grid of texels (grid points with one value per channel). Stored as
+/// `[size_b, size_a, channels]`, so that the channels of a texel are contiguous.
 #[derive(Debug, Clone)]
 pub(super) struct FeaturePlane {
     pub(super) size_a: usize,
@@ -43,8 +43,8 @@ pub(super) struct Level {
     pub(super) temporal: [FeaturePlane; 3],
 }
 
-/// The planes over (x, t), (y, t) and (z, t) of a level, interpolated at one time: one line `[size_a, channels]` for
-/// each of the axes x, y, z.
+/// Feature planes over (x, t), (y, t) and (z, t) of one level, interpolated at a fixed time t. What remains is one line
+/// of features, `[size_a, channels]`, for each of the axes x, y, z.
 pub(super) type TimeLines = [Vec<f32>; 3];
 
 /// Box in space that the feature planes cover.
@@ -81,7 +81,8 @@ pub(super) struct Planes {
     pub(super) levels: Vec<Level>,
 }
 
-/// Two neighboring texels along one axis, and their weights for linear interpolation at a coordinate between them.
+/// Two neighboring texels (grid points of a feature plane) along one axis, and the weight for linear interpolation at a
+/// coordinate between them.
 #[derive(Debug, Clone, Copy)]
 pub struct TexelPair {
     /// Index of the texel at or below the coordinate.
@@ -118,14 +119,15 @@ impl FeaturePlane {
         Ok((FeaturePlane { size_a, size_b, texels }, channels))
     }
 
-    /// Returns the channels of the texel at index `a` along the first and `b` along the second axis.
+    /// Returns the channels of the texel (grid point) with index `a` along the first axis of the plane and `b` along
+    /// the second. `channels` is the number of channels of the plane.
     pub(super) fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
         let start = (b as usize * self.size_a + a as usize) * channels;
         &self.texels[start..start + channels]
     }
 
-    /// Computes the bilinear sample of the plane into `out`, one value per channel. `a` and `b` say where to
-    /// interpolate along the two axes.
+    /// Interpolates the plane bilinearly at one point and writes one value per channel to `out`. `a` and `b` give the
+    /// neighboring texels (grid points) and their weights along the first and the second axis.
     fn sample(&self, a: TexelPair, b: TexelPair, out: &mut [f32]) {
         let channels = out.len();
         let corner = |ia, ib| self.texel(ia, ib, channels);
@@ -143,9 +145,9 @@ impl FeaturePlane {
     }
 }
 
-/// Returns the two of `size` texels between which the normalized coordinate `u` lies, and the weight of the second one.
-/// The first and last texel lie at −1 and 1 (`align_corners`), and coordinates beyond them are clamped. A NaN
-/// coordinate gives a NaN fraction, hence NaN features.
+/// Returns the two neighbors of the normalized coordinate `u` among `size` texels (grid points) along an axis, and the
+/// weight of the second one. The first texel lies at −1 and the last at 1 (`align_corners`). Coordinates beyond them
+/// are clamped. A NaN coordinate gives a NaN fraction, hence NaN features.
 pub fn texel_pair(u: f32, size: usize) -> TexelPair {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
@@ -166,7 +168,8 @@ pub fn count_unread_time_rows(name: &str, shape: &[usize]) -> usize {
     }
 }
 
-/// Returns the channels of the two texels of `line` that `tap` names, and the weight of the second texel.
+/// Returns two texels of `line` (one line of a plane, with `channels` values per texel): the channels of the texels
+/// `tap.low` and `tap.high`. Also returns the weight of the second texel for linear interpolation.
 #[inline(always)]
 pub(super) fn texels(line: &[f32], tap: TexelPair, channels: usize) -> ([&[f32]; 2], f32) {
     let texel = |at: u32| &line[at as usize * channels..][..channels];
@@ -250,9 +253,9 @@ impl Planes {
         self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
     }
 
-    /// Writes the features at one time of `lanes` Gaussians of the prepared block, from index `start` on, into `out`
-    /// `[width, LANES]`. `lines` are the planes with time, interpolated at this time ([`Planes::lines`]). Values of
-    /// unused lanes are 0.
+    /// Computes the features of `lanes` Gaussians of the prepared block, from index `start` on, at one time. Writes
+    /// them to `out` `[width, LANES]`; values of unused lanes are 0. `lines` are the planes with a time axis,
+    /// interpolated at this time ([`Planes::lines`]).
     #[inline(always)]
     pub(super) fn features(
         &self,

@@ -9,8 +9,9 @@
 use super::linear::{CacheLine, LANES};
 use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, texel_pair, texels};
 
-/// Returns the derivative of the texel coordinate with respect to the normalized coordinate `u`, for `size` texels.
-/// Returns 0 where [`texel_pair`] clamps `u`.
+/// Returns how many texels (grid points of a feature plane) lie in one unit of the normalized coordinate `u` along an
+/// axis of `size` texels. This factor converts derivatives per texel to derivatives with respect to `u`. Returns 0
+/// where [`texel_pair`] clamps `u`, beyond ±1.
 fn texels_per_unit(u: f32, size: usize) -> f32 {
     if u.abs() <= 1.0 { (size - 1) as f32 / 2.0 } else { 0.0 }
 }
@@ -18,7 +19,7 @@ fn texels_per_unit(u: f32, size: usize) -> f32 {
 /// Number of channels of a feature plane whose derivatives are computed together.
 const CHANNEL_CHUNK: usize = 8;
 
-/// Returns [`CHANNEL_CHUNK`] channels from index `first` on, filled up with zeros if fewer are left.
+/// Returns [`CHANNEL_CHUNK`] values of `channels` from index `first` on, filled up with zeros at the end of the list.
 #[inline(always)]
 fn channel_chunk(channels: &[f32], first: usize) -> [f32; CHANNEL_CHUNK] {
     let rest = &channels[first..];
@@ -32,7 +33,7 @@ fn channel_chunk(channels: &[f32], first: usize) -> [f32; CHANNEL_CHUNK] {
     }
 }
 
-/// Four texels of a feature plane around a point, with the data for bilinear interpolation between them.
+/// Four texels (grid points) of a feature plane around a point, with the data for bilinear interpolation between them.
 struct BilinearPatch<'a> {
     /// Channels of the texels (low a, low b), (high a, low b), (low a, high b), (high a, high b), where a and b are the
     /// axes of the plane.
@@ -76,8 +77,8 @@ impl<'a> BilinearPatch<'a> {
     }
 }
 
-/// Two neighboring texels with the data for linear interpolation between them. They lie on the line that remains of a
-/// space-time plane when its time is fixed.
+/// Two neighboring texels (grid points) with the data for linear interpolation between them. They lie on a line of
+/// features along one axis of space, which is what remains of a plane over this axis and time when the time is fixed.
 struct TimeLineSegment<'a> {
     ends: [&'a [f32]; 2],
     fraction: f32,
@@ -100,9 +101,13 @@ impl TimeLineSegment<'_> {
 }
 
 impl Planes {
-    /// Computes the features of up to [`LANES`] Gaussians at the positions `x`, `y`, `z` (scene units) and one time
-    /// into `features`, and their derivatives with respect to x, y and z into `slopes`. `lines` are the planes with
-    /// time, interpolated at this time ([`Planes::lines`]). Values of unused lanes are unspecified.
+    /// Computes the plane features of up to [`LANES`] Gaussians at one time, and their derivatives with respect to the
+    /// position.
+    ///
+    /// - `x`, `y`, `z`: positions of the Gaussians, scene units.
+    /// - `lines`: the planes with a time axis, interpolated at this time ([`Planes::lines`]).
+    /// - `features`: receives the features. Values of unused lanes are unspecified.
+    /// - `slopes`: receives the derivatives of the features with respect to x, y and z.
     #[inline(always)]
     pub(super) fn features_with_slopes(
         &self,

@@ -15,8 +15,8 @@ fn random_gaussians(len: usize) -> Gaussians {
     gaussians
 }
 
-/// Returns the attributes of the Gaussians `raw` at `time`, and the deltas by which they differ from `raw`, for the
-/// attributes `want`.
+/// Evaluates `field` for the stored Gaussians `raw` at `time`. Returns the attributes `want` of the Gaussians at this
+/// time, and the deltas that were added to the stored attributes.
 fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gaussians, Deltas) {
     let mut deltas = Deltas::new(3);
     field.deltas(&field.prepare(&raw.position), time, want, &mut LayerBuffers::default(), &mut deltas).unwrap();
@@ -304,8 +304,8 @@ fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
     gradients
 }
 
-/// Converts `gradients` from derivatives with respect to the attributes at `time` to derivatives with respect to the
-/// stored attributes `raw`.
+/// Converts `gradients` by the chain rule: from derivatives with respect to the attributes at `time` to derivatives
+/// with respect to the stored attributes `raw`.
 fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients) -> Gradients {
     let mut pulled = gradients.clone();
     field.jacobian(raw, &field.prepare(&raw.position), time, gradients.columns()).unwrap().pull_back(&mut pulled);

@@ -39,13 +39,14 @@ impl VoxelMask {
         Ok(VoxelMask { low, high, size: [grid.shape[2], grid.shape[3], grid.shape[4]], values: grid.data.clone() })
     }
 
-    /// Returns the mask of every Gaussian at `position` (`[3, N]`): the grid interpolated trilinearly, with grid points
-    /// on the corners of the box, and 0 outside the box.
+    /// Returns the mask (factor on the stored attributes) of every Gaussian at `position` (`[3, N]`): the grid
+    /// interpolated trilinearly, with grid points on the corners of the box, and 0 outside the box.
     pub(super) fn sample(&self, position: &AttributeValues) -> Vec<f32> {
         (0..position.len()).map(|i| self.sample_one(position.row(i))).collect()
     }
 
-    /// Returns the mask at position `p` (scene units) by trilinear interpolation.
+    /// Returns the mask (factor on stored attributes) at position `p`, scene units, by trilinear interpolation of the
+    /// grid.
     fn sample_one(&self, p: [f32; 3]) -> f32 {
         let at: [f32; 3] = std::array::from_fn(|axis| {
             let u = (p[axis] - self.low[axis]) / (self.high[axis] - self.low[axis]) * 2.0 - 1.0;

@@ -25,17 +25,18 @@ pub(super) struct Bins {
     spare: Vec<u64>,
     /// Number of tiles per row.
     tiles_across: usize,
-    /// For each tile, the number of (splat, tile) pairs up to and including this tile, over the whole render. The pairs
-    /// of a tile begin where the pairs of the previous tile end.
+    /// Prefix sums over the tiles of the whole render, row by row: for each tile, the number of (splat, tile) pairs of
+    /// this tile and of all tiles before it. The pairs of a tile begin where the pairs of the previous tile end.
     ends: Vec<usize>,
     /// First tile that [`Bins::next_strip`] has not returned yet.
     next_tile: usize,
     /// Tiles whose (splat, tile) pairs are in memory.
     strip: Range<usize>,
-    /// Splat of every (splat, tile) pair of the strip, tile after tile.
+    /// Index of the splat of every (splat, tile) pair of the strip, tile after tile, and nearest splat first within a
+    /// tile.
     pairs: Vec<u32>,
-    /// For each tile of the strip, the index in `pairs` at which the next splat of the tile is written. An additional
-    /// last entry holds the number of all pairs.
+    /// Used while `pairs` is filled: for each tile of the strip, the index in `pairs` at which its next splat is
+    /// written. An additional last entry holds the number of all pairs.
     next_slots: Vec<u32>,
 }
 
@@ -76,12 +77,16 @@ impl Bins {
         self.next_tile = 0;
     }
 
-    /// Computes the (splat, tile) pairs of the next strip of tiles. Returns the tiles of the strip, or `None` after the
-    /// last tile.
+    /// Computes the (splat, tile) pairs of the next strip, which are the tiles that are processed together. Returns the
+    /// range of tiles of the strip, or `None` after the last tile. `splats` must be the splats that [`Bins::begin`]
+    /// sorted.
     ///
-    /// A strip consists of as many whole rows of tiles as possible with at most `max_pairs` pairs in total. If a single
-    /// row has more pairs, the strip is a part of this row. If a single tile has more pairs, the strip is this tile.
-    /// `splats` must be the splats that [`Bins::begin`] sorted.
+    /// A strip has at most `max_pairs` pairs:
+    ///
+    /// - It consists of as many whole rows of tiles as this limit allows.
+    /// - If a single row has more pairs, the strip is a part of this row.
+    /// - If a single tile has more pairs, the strip is this tile, which is the only case in which the limit is
+    ///   exceeded.
     pub(super) fn next_strip(&mut self, splats: &Splats, max_pairs: usize) -> Option<Range<usize>> {
         if self.is_last_strip() {
             return None;
@@ -122,9 +127,14 @@ impl Bins {
         Some(self.strip.clone())
     }
 
-    /// Returns the longest range that starts with the first of the non-empty `tiles`, has at most `max_pairs` (splat,
-    /// tile) pairs in total, and ends at the end of a row of tiles or of `tiles`. If the first row alone has more
-    /// pairs, the range ends within this row. It has at least one tile.
+    /// Returns the first part of `tiles` that is processed at once: a range that starts at `tiles.start`, of at least
+    /// one tile. `tiles` must not be empty.
+    ///
+    /// - The range is as long as possible with at most `max_pairs` (splat, tile) pairs. A first tile with more pairs is
+    ///   a range by itself.
+    /// - The range ends at the end of a row of tiles if it holds at least one row end. If not, it ends within the first
+    ///   row.
+    /// - If all of `tiles` fits, the range is all of `tiles`.
     fn first_part(&self, tiles: Range<usize>, max_pairs: usize) -> Range<usize> {
         let Range { start: first, end: last } = tiles;
         let before = self.start(first);
@@ -149,14 +159,15 @@ impl Bins {
         self.next_tile == self.ends.len()
     }
 
-    /// Returns the splat of every (splat, tile) pair of `tiles`, tile after tile. The tiles must lie in the strip.
+    /// Returns the index of the splat of every (splat, tile) pair of `tiles`, tile after tile. The tiles must lie in
+    /// the strip, whose pairs are in memory.
     pub(super) fn pairs(&self, tiles: Range<usize>) -> &[u32] {
         let before = self.start(self.strip.start);
         &self.pairs[self.start(tiles.start) - before..self.start(tiles.end) - before]
     }
 
-    /// Iterates over the rows of tiles that `tiles` touches. Yields the index of the row, and the columns of the tiles
-    /// in that row.
+    /// Splits the range `tiles` of tile numbers into rows of tiles. Yields for each row that contains one of these
+    /// tiles a pair: the index of the row, and the range of columns of these tiles.
     pub(super) fn rows(&self, tiles: Range<usize>) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
         let tiles_across = self.tiles_across;
         (tiles.start / tiles_across.max(1)..tiles.end.div_ceil(tiles_across.max(1))).map(move |y| {
@@ -165,7 +176,8 @@ impl Bins {
         })
     }
 
-    /// Returns the splats of the tiles in row `y` and columns `x`, tile after tile. The tiles must lie in the strip.
+    /// Returns the indices of the splats of the tiles in row `y` and columns `x` of the tiles, tile after tile. The
+    /// tiles must lie in the strip, whose pairs are in memory.
     pub(super) fn pairs_in_row(&self, y: usize, x: Range<usize>) -> &[u32] {
         self.pairs(y * self.tiles_across + x.start..y * self.tiles_across + x.end)
     }

@@ -24,7 +24,7 @@ pub(super) type TilePlane = Aligned<[[f32; LANES]; GROUPS]>;
 /// One f32 for each sampled row, or each sampled column, of a tile.
 type TileLine = Aligned<[[f32; LANES]; SIDE / LANES]>;
 
-/// Pixels of a tile of a render. In a render of a grid of pixels, a tile has 16×16 pixels of the grid.
+/// Pixels of one tile of a render. If only a grid of pixels is rendered, a tile has 16×16 pixels of the grid.
 pub(super) struct SampledPixels {
     /// Column in the image of the first pixel of the tile.
     x0: f64,
@@ -34,8 +34,8 @@ pub(super) struct SampledPixels {
     xs: TileLine,
     /// Offset of each row of the tile from its first row, in pixels of the image.
     ys: TileLine,
-    /// Offsets of the first and of the last column of each half of the tile from the first column of the tile, in
-    /// pixels of the image. The left and the right half have up to eight columns of the render each.
+    /// For the left and the right half of the tile, the offsets of its first and of its last column from the first
+    /// column of the tile, in pixels of the image. Each half has up to eight columns of the render.
     spans: [[f32; 2]; SIDE / LANES],
     /// Number of columns of the tile that belong to the render.
     across: usize,
@@ -44,8 +44,9 @@ pub(super) struct SampledPixels {
 }
 
 impl SampledPixels {
-    /// Returns the pixels of one tile of a render. The render has only the pixels of the image that belong to `grid`:
-    /// `size[0]` columns and `size[1]` rows of pixels. The tile is in column `tile[0]` and row `tile[1]` of the tiles.
+    /// Computes the positions of the pixels of one tile of a render. `tile` is the (column, row) of the tile among the
+    /// tiles of the render. The render consists of the pixels of the image that belong to `grid`, and `size` is its
+    /// number of (columns, rows) of pixels.
     pub(super) fn new(tile: [u32; 2], size: [u32; 2], grid: PixelGrid) -> Self {
         let line = |axis: usize| {
             let first = tile[axis] * TILE;
@@ -65,8 +66,8 @@ impl SampledPixels {
         SampledPixels { x0, y0, xs, ys, spans, across, down }
     }
 
-    /// Returns which groups of [`LANES`] neighboring pixels in a row of the tile contain a pixel of the render, one bit
-    /// per group.
+    /// Returns a bit set of the groups (eight neighboring pixels in a row of the tile) that contain a pixel of the
+    /// render.
     fn groups(&self) -> u32 {
         let rows = ((1u64 << self.down) - 1) as u32;
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
@@ -90,7 +91,8 @@ pub(super) struct Fragment<V: Lanes> {
     pub(super) blended: V::Mask,
     /// Weight of the splat in the pixel, alpha · transmittance; 0 where the splat is not blended.
     pub(super) weight: V,
-    /// Transmittance behind the splat, never 0. Negative in pixels that have ended, where the weight is 0.
+    /// Transmittance behind the splat, never 0. The sign is a flag: negative in pixels that have ended, in which no
+    /// further splat is blended. The weight is 0 there.
     pub(super) transmittance_after: V,
     /// Offset along x of the pixel from the point of its row at which the alpha of the splat is largest, pixels: dx −
     /// shear·dy of [`Splat`].
@@ -99,35 +101,38 @@ pub(super) struct Fragment<V: Lanes> {
     pub(super) offset_y: V,
 }
 
-/// Receiver of the weights alpha · transmittance of each splat while a tile is blended.
+/// Receiver of the weight alpha · transmittance of each splat in each pixel while a tile is blended. Its
+/// implementations compute colors, contributions, removal errors or gradients from the weights.
 pub(super) trait BlendSink {
-    /// Values that are accumulated for one splat while it is blended.
+    /// Values that are summed up for one splat over the pixels of the tile.
     type Accumulator<V: Lanes>: Copy;
-    /// Returns the accumulator with which the blending of `splat` begins.
+    /// Returns the initial values that are summed up for `splat`, before any pixel is added.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Adds `fragment` to the accumulator, and returns the accumulator. `fragment` holds the values of the splat at the
-    /// pixels of group `group`; a group is [`LANES`] neighboring pixels in a row of the tile. If `V` has more than
-    /// [`LANES`] lanes, `fragment` also holds the values at the pixels of the following groups.
+    /// Adds the values of a splat in some pixels to its accumulator, and returns the accumulator. `fragment` holds the
+    /// values in the pixels of group `group`; a group is [`LANES`] neighboring pixels in a row of the tile. If `V` has
+    /// more than [`LANES`] lanes, `fragment` also holds the values in the pixels of the following groups.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
         group: usize,
         fragment: Fragment<V>,
     ) -> Self::Accumulator<V>;
-    /// Whether a splat is blended in all groups of pixels with even index before the groups with odd index. Has an
-    /// effect only if a vector holds a single group.
+    /// Order in which a splat is blended in the groups of eight pixels of a tile. If true: first all groups with even
+    /// index, then all groups with odd index. If false: by increasing index. Has an effect only if a vector holds a
+    /// single group.
     const SPLITS_EVEN_ODD: bool = false;
-    /// Swaps the two sums of an accumulator that keeps one sum over even groups of pixels and one over odd groups, and
-    /// returns the accumulator. The following groups are then added to the other sum. Called twice per splat: after the
-    /// groups with even index, and after the groups with odd index.
+    /// Swaps the two sums of an accumulator that keeps one sum for groups of pixels with even index and one for groups
+    /// with odd index. Each added group goes to the first sum, so a swap directs the following groups to the other sum.
+    /// Called twice per splat: after the groups with even index, and after the groups with odd index.
     ///
-    /// Returns `accumulator` unchanged if a vector holds more than one group of eight pixels. The default
-    /// implementation, for accumulators without such sums, always returns it unchanged.
+    /// The default implementation returns the accumulator unchanged: it is for sinks that keep no such sums. A sink
+    /// that keeps them must also return it unchanged for vectors of several groups, which add to both sums at once.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
     }
-    /// Receives the final accumulator of the splat with index `pair` in the list of splats of the tile.
+    /// Stores the result for a splat, whose values in all pixels have been added to `accumulator`. `pair` is the index
+    /// of the splat in the list of splats of the tile.
     fn end<V: Lanes>(&mut self, accumulator: Self::Accumulator<V>, pair: usize);
 }
 
@@ -164,14 +169,14 @@ pub(super) struct Weight {
     pub(super) max: f32,
 }
 
-/// Receiver of weights (alpha · transmittance of each splat) that stores, in `pairs`, the sum and the largest value of
-/// the weights of each splat of the tile. Every entry of `pairs` must be zero at the start.
+/// Receiver of weights (alpha · transmittance of each splat in each pixel) that computes, for each splat of a tile, the
+/// sum and the maximum of its weights. `pairs` has one entry per splat of the tile, which must be zero at the start.
 pub(super) struct WeightSink<'a> {
     pub(super) pairs: &'a mut [Weight],
 }
 
 impl BlendSink for WeightSink<'_> {
-    /// Sum of the weights of the splat so far, and the largest of them.
+    /// Sum of the weights of the splat so far for each lane, then the largest weight so far in each lane.
     type Accumulator<V: Lanes> = (V::Sums, V);
     #[inline(always)]
     fn begin<V: Lanes>(&self, _: &Splat) -> (V::Sums, V) {
@@ -230,9 +235,11 @@ impl BlendKernel {
         }
     }
 
-    /// Blends the splats with the indices `pairs`, which are ordered from front to back, over the sampled pixels of a
-    /// tile. Returns the remaining transmittance of each pixel, with the sign bit set if the pixel ended, that is, if a
-    /// further splat would have lowered its transmittance below [`MIN_TRANSMITTANCE`].
+    /// Blends splats over the pixels of a tile and passes their weights to `sink`. `pairs` holds the indices in
+    /// `splats` of the splats of the tile, nearest first. `sampled` are the pixels.
+    ///
+    /// Returns the remaining transmittance of each pixel. Its sign bit is set if the pixel has ended, that is, if a
+    /// further splat would have lowered the transmittance below [`MIN_TRANSMITTANCE`].
     pub(super) fn tile(
         self,
         splats: &[Splat],
@@ -281,8 +288,9 @@ impl BlendKernel {
 /// is blended, the processor would notice each misprediction only after this computation and its reads from memory.
 const LOOKAHEAD: usize = 16;
 
-/// Footprint of one splat in the rows of a tile. In a row, alpha at the column x is the opacity times 2 to the power of
-/// `level − falloff_x·(x − middle)²`, with `level` and `middle` of this row.
+/// Footprint of one splat in one tile. In a row of the tile, alpha at the column x is the opacity times 2 to the power
+/// of `level − falloff_x·(x − middle)²`. `level` and `middle` belong to the row and are stored here; `falloff_x` is a
+/// field of [`Splat`].
 #[derive(Clone, Copy, Default)]
 struct TileFootprint {
     /// Index of the splat in the list of splats of the tile.
@@ -331,8 +339,8 @@ impl TileFootprint {
         footprint
     }
 
-    /// Excludes the pixels that lie outside [`Splat::drawn_tiles`], the tiles of the full image in which `splat` is
-    /// drawn.
+    /// Removes the pixels outside the tiles in which the original CUDA rasterizer draws the splat
+    /// ([`Splat::drawn_tiles`]) from the footprint.
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));
@@ -443,8 +451,9 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
     transmittance
 }
 
-/// Returns `live` without `ended`. Both are sets of vectors of pixels, one bit per vector. All pixels of a vector in
-/// `ended` have ended: their transmittance is used up, and no further splat is blended in them.
+/// Returns the bit set `live` without the bits of `ended`. Each bit stands for a vector of pixels. A bit of `ended`
+/// means that all pixels of its vector have ended: their transmittance is used up, and no further splat is blended in
+/// them.
 ///
 /// The function is cold and not inlined, so that its call remains a branch, which the processor predicts. Without the
 /// branch, `live` would depend on the result of every splat, and the next splat could not begin before all pixels of

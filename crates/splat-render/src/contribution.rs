@@ -1,10 +1,11 @@
-//! Visible contribution of every Gaussian to renders: its weight alpha · transmittance, summed over pixels.
+//! Visible contribution of every Gaussian to renders: its weight in a pixel (alpha · transmittance), summed over
+//! pixels.
 
 use serde::{Deserialize, Serialize};
 
-/// Visible contribution of N Gaussians, summed over any number of views (docs/method.md, section 1: the sum is C with
-/// the option `visible`, the largest weight is W). The weight of a Gaussian in a pixel is its alpha times the
-/// transmittance in front of it.
+/// Visible contribution of N Gaussians, over any number of views: the sum and the maximum of the weights of each
+/// Gaussian in all pixels. The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it. In
+/// docs/method.md, section 1, the sum is C with the option `visible`, and the maximum is W.
 ///
 /// The values do not depend on the order of views or the number of threads. Memory: 12 bytes per Gaussian.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

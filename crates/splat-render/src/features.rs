@@ -1,4 +1,4 @@
-//! Blending of feature vectors of Gaussians instead of colors.
+//! Renders feature vectors of Gaussians: blends features in place of colors.
 //!
 //! Input: Gaussians at one frame, and features, each with a value of any sign per Gaussian. Output: blended features
 //! per pixel. Blending is linear, so three features at a time are rendered as colors. Features are shifted and scaled
@@ -45,8 +45,8 @@ pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera:
     blended
 }
 
-/// Returns the smallest finite value in `values`, and the difference between the largest and the smallest finite value
-/// (1 if they are equal or if no value is finite).
+/// Returns two numbers: the smallest finite value in `values`, and the difference between the largest and the smallest
+/// finite value. The difference is given as 1 if all values are equal or none is finite.
 fn span(values: &[f32]) -> [f64; 2] {
     let finite = || values.iter().copied().filter(|x| x.is_finite()).map(f64::from);
     let (least, most) = (finite().fold(f64::INFINITY, f64::min), finite().fold(f64::NEG_INFINITY, f64::max));

@@ -42,8 +42,8 @@ impl PixelGrid {
         [0, 1].map(|axis| size[axis].saturating_sub(self.phase[axis]).div_ceil(self.stride))
     }
 
-    /// Returns the column of the image at which column `index` of the grid lies (`axis` 0), or the row of the image at
-    /// which row `index` of the grid lies (`axis` 1).
+    /// Returns the position in the image of a column or row of the grid, in pixels: of the column with the given
+    /// `index` if `axis` is 0, and of the row with this index if `axis` is 1.
     pub fn pixel(self, axis: usize, index: u32) -> u32 {
         self.phase[axis] + self.stride * index
     }
@@ -53,10 +53,13 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Returns the rectangle of tiles of the grid (16×16 pixels of the grid each) that a splat can change; it may be
-    /// empty. `rect` are the tiles of the full image that the splat can change, `at` is its center, `half` half its
-    /// width and height, and `size` the size of the image, in pixels. The result contains every pixel of the grid that
-    /// lies in `rect` and at most `half` from `at` on each axis.
+    /// Returns the tiles of the grid (16×16 pixels of the grid each) in which a splat can change a pixel; there may be
+    /// none. They contain every pixel of the grid that lies in `rect` and at most `half` from `at` on each axis.
+    ///
+    /// - `rect`: tiles of the full image that the splat can change.
+    /// - `at`: center of the splat, pixels.
+    /// - `half`: half the width and half the height of the splat, pixels.
+    /// - `size`: width and height of the image, pixels.
     pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
         if self.stride == 1 {
             return rect;
@@ -76,8 +79,8 @@ impl PixelGrid {
         TileRect { x0, x1, y0, y1 }
     }
 
-    /// Returns the number of columns of the grid to the left of column `pixel` of the image (`axis` 0), or the number
-    /// of rows of the grid above row `pixel` of the image (`axis` 1).
+    /// Returns how many columns of the grid lie to the left of column `pixel` of the image (`axis` 0), or how many rows
+    /// of the grid lie above row `pixel` of the image (`axis` 1).
     fn count_before(self, axis: usize, pixel: u32) -> u32 {
         pixel.saturating_sub(self.phase[axis]).div_ceil(self.stride)
     }

@@ -23,7 +23,7 @@ const FOV_MARGIN: f64 = 1.3;
 /// Limit of the absolute value of a log scale and of an opacity logit. Values are clamped, so that fourth powers of
 /// scales stay finite in f64.
 pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
-/// Opacity logit below which the opacity is below 0.0025, hence less than [`MIN_ALPHA`].
+/// Opacity logit below which a Gaussian is invisible: its opacity is then below 0.0025, hence less than [`MIN_ALPHA`].
 const MIN_LOGIT: f32 = -6.0;
 /// Amount by which the test alpha ≥ 1/255 is relaxed, as a difference of log₂ alpha. It is thousands of times the
 /// rounding error of the exponent of alpha, so rounding never removes a visible pixel.
@@ -107,8 +107,8 @@ pub(super) struct Splat {
     pub(super) shear: f32,
     /// Coefficient of dy² in the exponent of alpha, 1/pixels², where dy is the offset of a pixel row from the center.
     pub(super) falloff_y: f32,
-    /// Range of the exponent (of 2) in the formula of alpha: pixels whose exponent is below `−cutoff` are skipped,
-    /// because their alpha is below 1/255.
+    /// Cutoff for the exponent (of 2) in the formula of alpha: a pixel whose exponent is below `−cutoff` is skipped,
+    /// because its alpha is below 1/255.
     pub(super) cutoff: f32,
     /// Opacity of the Gaussian, in [0, 1].
     pub(super) opacity: f32,
@@ -120,8 +120,10 @@ pub(super) struct Splat {
     pub(super) color: [f32; 3],
     /// Index of the Gaussian in the frame.
     pub(super) id: u32,
-    /// Tiles of the full image in which the splat is drawn, as `[x0, x1, y0, y1]`: columns from x0 to below x1, rows
-    /// from y0 to below y1. Pixels outside these tiles are excluded, although alpha may exceed 1/255 there.
+    /// Tiles in which the original CUDA rasterizer draws the splat, as `[x0, x1, y0, y1]`: columns from x0 to below x1,
+    /// rows from y0 to below y1 of the tiles of the full image. Pixels outside these tiles are excluded, although alpha
+    /// may exceed 1/255 there.
+    ///
     /// [`Splat::UNBOUNDED`] if no pixel has to be excluded. Used only in renders of a grid of pixels, whose tiles are
     /// larger than those of the image.
     pub(super) drawn_tiles: [u16; 4],
@@ -142,8 +144,8 @@ pub(super) struct TileRect {
 }
 
 impl TileRect {
-    /// Returns the range of columns and the range of rows of tiles, `[x0, x1, y0, y1]`, as 16-bit integers. Larger
-    /// values become 65,535.
+    /// Returns the rectangle as `[x0, x1, y0, y1]` in 16-bit integers: columns of tiles from x0 to below x1, rows of
+    /// tiles from y0 to below y1. A number above 65,535 becomes 65,535.
     fn narrow(self) -> [u16; 4] {
         [self.x0, self.x1, self.y0, self.y1].map(|tile| tile.try_into().unwrap_or(u16::MAX))
     }
@@ -171,8 +173,8 @@ impl Splats {
     }
 }
 
-/// Appends the splats of those Gaussians of `ids` that are visible in `view` to `out`. If `colored`, their colors are
-/// computed, otherwise they are black.
+/// Projects the Gaussians with the indices `ids` and appends the splats of the visible ones to `out`. `colored` states
+/// whether to compute the colors of the splats; without it, they are black.
 ///
 /// A Gaussian with a position, rotation, scale or opacity that is not finite is not visible.
 pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
@@ -235,11 +237,11 @@ struct ProjectedSplats {
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
-    /// Half the width in pixels of the ellipse on which alpha is half its maximum. Multiplied by the square root of
-    /// [`Splat::cutoff`], it bounds the ellipse alpha ≥ 1/255.
+    /// Half the width in pixels of the ellipse on which alpha is half its maximum. Half the width of the ellipse alpha
+    /// ≥ 1/255 is at most this number times the square root of [`Splat::cutoff`].
     half_u: [f64; BLOCK],
-    /// Half the height in pixels of the ellipse on which alpha is half its maximum. Multiplied by the square root of
-    /// [`Splat::cutoff`], it bounds the ellipse alpha ≥ 1/255.
+    /// Half the height in pixels of the ellipse on which alpha is half its maximum. Half the height of the ellipse
+    /// alpha ≥ 1/255 is at most this number times the square root of [`Splat::cutoff`].
     half_v: [f64; BLOCK],
     /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
     radius: [f64; BLOCK],
@@ -299,8 +301,8 @@ impl ProjectedSplats {
         }
     }
 
-    /// Returns the splat of Gaussian `i` of the block and the tiles that it can change, or `None` if it cannot change
-    /// any pixel. `id` is the index of the Gaussian in the frame.
+    /// Returns two values for Gaussian `i` of the block: its splat, and the tiles that the splat can change. Returns
+    /// `None` if it cannot change any pixel. `id` is the index of the Gaussian in the frame.
     #[inline(always)]
     fn splat(&self, i: usize, id: u32, view: &CameraTerms) -> Option<(Splat, TileRect)> {
         let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
@@ -423,10 +425,13 @@ pub(super) fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + exp(clamp_to(-f64::from(logit), LOGARITHM_LIMIT)))
 }
 
-/// Returns the range of tiles (first, end) along one axis that a splat can change. These are the tiles that the
-/// original CUDA rasterizer draws for `at ± radius`, except tiles whose pixels are all further than `half` from `at`.
-/// `at` is the center of the splat along the axis. `at`, `radius` and `half` are in pixels; `tiles` is the number of
-/// tiles of the image.
+/// Returns the range of tiles along one axis, as (first, end), that a splat can change. These are the tiles that the
+/// original CUDA rasterizer draws, except tiles whose pixels are all further than `half` from the center of the splat.
+///
+/// - `at`: center of the splat along the axis, pixels.
+/// - `radius`: half the side of the square that the original rasterizer draws, pixels.
+/// - `half`: half the extent of the splat along the axis (where alpha ≥ 1/255), pixels.
+/// - `tiles`: number of tiles of the image along the axis.
 #[inline(always)]
 fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
     let tile = f64::from(TILE);

@@ -1,10 +1,12 @@
-//! Error that the removal of a Gaussian causes in a render.
+//! Computes the error in a render that the removal of each single Gaussian would cause.
 //!
-//! In a pixel, a Gaussian of color c has the weight w = alpha · transmittance and hides what is behind it, which has
-//! the color b. Without the Gaussian the pixel changes by exactly w·(c − b), so a Gaussian of the same color as what is
-//! behind it can be removed without error, even if its weight is large. If several Gaussians are removed at once, the
-//! changes add up, and b changes too. Therefore ‖c − b‖ gets a minimum (the floor), and Gaussians are removed in
-//! several rounds with new errors.
+//! In a pixel, a Gaussian of color c has the weight w = alpha · transmittance, and hides the color b of what is behind
+//! it. Without this Gaussian, the pixel changes by exactly w·(c − b). So a Gaussian of the same color as what is behind
+//! it can be removed without error, even if its weight is large.
+//!
+//! If several Gaussians are removed at once, their changes add up, and b changes too. Therefore the square of a
+//! constant (the floor) is added to ‖c − b‖², and Gaussians are removed in several rounds, each with newly computed
+//! errors.
 
 use serde::{Deserialize, Serialize};
 
@@ -25,8 +27,8 @@ pub struct RemovalError {
     /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed
     /// per 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
     pub sum: Vec<u64>,
-    /// Floor: color difference (norm over red, green, blue) whose square is added to the squared color difference
-    /// between a Gaussian and what is behind it.
+    /// Floor: color difference (norm over red, green and blue) that counts even between equal colors. Its square is
+    /// added to the squared difference between the color of a Gaussian and the color behind it.
     pub contrast_floor: f32,
 }
 
@@ -35,8 +37,8 @@ impl RemovalError {
     /// 320×256 pixels.
     pub const SUM_UNIT: f64 = 1.0 / (1u64 << 36) as f64;
 
-    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. For `contrast_floor` see
-    /// [`RemovalError::contrast_floor`].
+    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. The square of `contrast_floor`
+    /// is added to each squared color difference ([`RemovalError::contrast_floor`]).
     pub fn new(len: usize, contrast_floor: f32) -> Self {
         RemovalError { sum: vec![0; len], contrast_floor }
     }
@@ -51,9 +53,9 @@ impl RemovalError {
         self.sum.is_empty()
     }
 
-    /// Selects `count` Gaussians to keep, and returns their indices in increasing order. Selects first the Gaussians
-    /// for which `fixed` is true, then the Gaussians with the largest removal error. Of equal errors, the lower index
-    /// is preferred.
+    /// Selects `count` Gaussians to keep, and returns their indices in increasing order. Gaussians for which `fixed`
+    /// returns true are selected first, then the Gaussians with the largest removal error. Of equal errors, the lower
+    /// index is selected first.
     pub fn top_by_error(&self, count: usize, fixed: impl Fn(usize) -> bool) -> Vec<u32> {
         let mut ids: Vec<u32> = (0..self.len() as u32).collect();
         // A stable sort keeps ties in index order.
@@ -72,8 +74,8 @@ impl RemovalError {
         self.sum.iter_mut().zip(&other.sum).for_each(|(sum, other)| *sum = sum.saturating_add(*other));
     }
 
-    /// Adds the removal errors of `other`, which holds only some of the Gaussians: Gaussian k of `other` is Gaussian
-    /// `rows[k]` of `self`.
+    /// Adds the removal errors of `other` to some of the Gaussians: the error of Gaussian k of `other` is added to
+    /// Gaussian `rows[k]` of `self`.
     pub fn merge_rows(&mut self, rows: &[u32], other: &RemovalError) {
         for (&row, other) in rows.iter().zip(&other.sum) {
             let sum = &mut self.sum[row as usize];
@@ -91,10 +93,12 @@ impl RemovalError {
 /// Receiver of weights (alpha · transmittance of each splat) that computes the removal error of every splat of a tile
 /// while the tile is blended.
 pub(super) struct RemovalSink<'a> {
-    /// Colors of the pixels, by channel, minus weight times color of all splats that have been blended so far. This is
-    /// the color behind these splats times the transmittance.
+    /// Part of the color of each pixel that comes from behind the splats blended so far, one plane per channel. It is
+    /// the color behind these splats times the transmittance, computed as the color of the pixel minus weight · color
+    /// of each of these splats.
     pub(super) behind: [TilePlane; 3],
-    /// Floor of the color difference, see [`RemovalError::contrast_floor`].
+    /// Floor: color difference that counts even between equal colors. Its square is added to the squared difference
+    /// between the color of a splat and the color behind it ([`RemovalError::contrast_floor`]).
     pub(super) contrast_floor: f32,
     /// For each splat of the tile, the squared error that its removal would cause in the pixels of the tile: Σ w²·(‖c −
     /// b‖² + floor²), as in [`RemovalError`].
@@ -102,8 +106,8 @@ pub(super) struct RemovalSink<'a> {
 }
 
 impl BlendSink for RemovalSink<'_> {
-    /// Color of a splat, and the sum so far of the squared changes of pixels that the removal of this splat would
-    /// cause.
+    /// Color of a splat (red, green, blue), then the removal error of this splat so far: the sum over pixels of its
+    /// squared change.
     type Accumulator<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {
@@ -166,7 +170,9 @@ mod tests {
         Camera::look_at(DVec3::new(1.0, -3.0, 0.4), DVec3::ZERO, 0.6, (45, 37))
     }
 
-    /// Returns the removal errors of all Gaussians of `scene` with the contrast floor `floor`.
+    /// Returns the removal errors of all Gaussians of `scene` (squared error in a render that the removal of the
+    /// Gaussian causes). The square of `floor`, the contrast floor, is added to each squared color difference, so that
+    /// removing a Gaussian in front of its own color counts, too.
     fn errors(scene: &Gaussians, floor: f32) -> Vec<f64> {
         let mut found = RemovalError::new(scene.len(), floor);
         Renderer::new().removal_error(scene, &camera(), BACKGROUND, &mut found);

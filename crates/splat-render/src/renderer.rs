@@ -1,5 +1,5 @@
-//! Renderer: computes renders, contributions and removal errors of one frame from one camera by running the parts of
-//! the rasterizer in order.
+//! Renderer: computes the image, the contributions and the removal errors of one frame from one camera. Runs the parts
+//! of the rasterizer in order: projection, assignment to tiles, blending.
 
 use std::num::NonZeroU32;
 use std::ops::Range;
@@ -23,8 +23,8 @@ const SPAN: usize = 32 * BLOCK;
 /// Bytes of memory per visible Gaussian during a render: footprint, tile rectangle, and two copies of the depth sort
 /// key.
 pub const BYTES_PER_VISIBLE: usize = size_of::<Splat>() + size_of::<TileRect>() + 2 * size_of::<u64>();
-/// Bytes of memory during a render for the (Gaussian, tile) pairs of a strip of tiles, and for the sum and the largest
-/// value of the weights of each pair.
+/// Bytes of memory during a render for the (splat, tile) pairs of a strip, which are the tiles that are processed
+/// together. Includes the sum and the maximum of the weights of each pair.
 pub const STRIP_BYTES: usize = STRIP_PAIRS * (size_of::<u32>() + size_of::<Weight>());
 
 /// Image with red, green and blue per pixel, row by row from the top. White is 1. Values are not clamped.
@@ -68,9 +68,9 @@ pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> I
 /// Adds the visible contribution of each Gaussian in the view of `camera` (alpha · transmittance, summed over pixels)
 /// to `seen`, on all threads of the rayon pool. SH coefficients are not read.
 ///
-/// Only every `stride`-th pixel in both directions is sampled: those whose coordinates have the remainder `stride / 2`
-/// modulo `stride`. Footprints are those of the full image. The sums are over the sampled pixels, so a stride of s
-/// gives about 1/s² of the full sums.
+/// Only every `stride`-th pixel in both directions is sampled: the pixels whose column and row have the remainder
+/// `stride / 2` when divided by `stride`. Footprints are those of the full image. The sums are over the sampled pixels,
+/// so a stride of s gives about 1/s² of the full sums.
 ///
 /// # Panics
 /// Panics if `seen` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
@@ -136,7 +136,8 @@ impl Renderer {
         self.render_prepared(&view, background)
     }
 
-    /// Blends the splats that [`Renderer::prepare`] has projected, and returns the image.
+    /// Blends the splats that [`Renderer::prepare`] has projected and sorted, and returns the image. `view` must be the
+    /// view of that call.
     pub(super) fn render_prepared(&mut self, view: &CameraTerms, background: [f32; 3]) -> Image {
         let [width, height] = view.size;
         let row_len = width as usize * 3;
@@ -202,8 +203,8 @@ impl Renderer {
         }
     }
 
-    /// Adds the removal error of each Gaussian in `view` (the error of a render without this Gaussian) to `errors`, on
-    /// the calling thread. Errors are sums over the pixels of the grid of `view`.
+    /// Adds the removal error of each Gaussian in `view` (the squared error of a render without this Gaussian) to
+    /// `errors`. Errors are sums over the pixels of the grid of `view`. Tiles are blended on the calling thread only.
     ///
     /// # Panics
     /// Panics if `errors` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
@@ -235,8 +236,8 @@ impl Renderer {
         }
     }
 
-    /// Projects the Gaussians to splats, which this renderer keeps, and sorts the splats by depth. Computes colors only
-    /// if `colored`.
+    /// Projects the Gaussians to splats, which this renderer keeps for later calls, and sorts the splats by depth.
+    /// `colored` states whether to compute the colors of the splats, too.
     pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colored: bool) {
         let count = gaussians.len();
         self.splats.clear();
@@ -257,11 +258,12 @@ impl Renderer {
     }
 }
 
-/// Computes one value, such as a removal error, for each (splat, tile) pair of `tiles` into `sums`. The tiles must lie
-/// in the strip in memory.
+/// Computes one value of type `T` for each (splat, tile) pair of `tiles`, for example a removal error, and writes the
+/// values to `sums`. The tiles must lie in the strip, whose pairs are in memory.
 ///
-/// Sets all values to the default, then calls `fill_tile` for each tile with its column and row, its splats, and the
-/// values of its pairs. Rows of tiles are processed in parallel if `parallel`.
+/// All values are set to the default of `T` first. Then `fill_tile` is called for each tile, with three arguments: the
+/// column and row of the tile, the indices of its splats, and the values of its pairs. `parallel` states whether rows
+/// of tiles are processed in parallel.
 pub(super) fn fill_pairs<T: Copy + Default + Send>(
     bins: &Bins,
     tiles: Range<usize>,
@@ -293,8 +295,8 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
     }
 }
 
-/// Returns the colors of the sampled pixels of one tile, one plane per channel. `pairs` are the splats of the tile,
-/// nearest first.
+/// Blends the splats of one tile and returns the colors of its sampled pixels, one plane per channel. `pairs` holds the
+/// indices in `splats` of the splats of the tile, nearest first.
 fn blend_colors(
     blend: BlendKernel,
     splats: &[Splat],
@@ -395,7 +397,8 @@ mod tests {
         }
     }
 
-    /// Returns grids with strides from 2 to 5, with all phases along x and several along y.
+    /// Returns grids of pixels for tests: with strides from 2 to 5, each with all offsets of the first column and
+    /// several offsets of the first row.
     fn grids() -> impl Iterator<Item = PixelGrid> {
         (2..6).flat_map(|stride| {
             (0..stride).map(move |phase| PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase, 3 * phase + 1]))

@@ -1,4 +1,4 @@
-//! Reads the frames of one tile one by one.
+//! Reads the frames of a tile (one column for a block of Gaussians and frames) one by one.
 
 use std::ops::Range;
 use std::sync::atomic::Ordering;
@@ -51,11 +51,12 @@ impl Reader {
     /// Checks the checksum of a raw tile (plain f32) if no earlier call has checked it. `buffer` is used only while
     /// loading. Fails if there is no such tile, if its bytes are damaged, or if they cannot be read.
     ///
-    /// If `touched` is given, stored bytes are read in place from the memory map, under the conditions of
-    /// [`Reader::tile`]. Their range is added to `touched`, so that [`Reader::release`] can release their pages: those
-    /// of a compressed tile after this call, those of a raw tile after its last frame was read. If `touched` is `None`,
-    /// bytes are read by system calls as in [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is
-    /// read before its pages are released.
+    /// `touched` selects between two ways of reading the stored bytes:
+    /// - `Some`: reads them in place from the memory map, under the conditions of [`Reader::tile`]. Adds the range of
+    ///   the read bytes to `touched`, so that the caller can release their pages with [`Reader::release`]: those of a
+    ///   compressed tile after this call, those of a raw tile after its last frame was read.
+    /// - `None`: reads them by system calls, as [`Reader::read_tile`] does. This is cheaper if only one frame of a raw
+    ///   tile is read before its pages are released.
     pub fn load(
         &self,
         at: TileId,
@@ -182,15 +183,16 @@ impl Reader {
         self.file.release(merged);
     }
 
-    /// Returns the loaded tile, and the index of its frame `frame` among its stored frames. The index is `frame`, or 0
-    /// if all frames are equal, because only one is stored then.
+    /// Returns the index entry of the tile loaded into `frames`, and the position of its frame `frame` among its stored
+    /// frames. The position is `frame`, or 0 if all frames are equal, because only one is stored then.
     fn loaded_frame(&self, frames: &TileFrames, frame: usize) -> (TileRecord, usize) {
         let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
         assert!(frame < tile.frames as usize, "frame {frame} of {tile:?}");
         (tile, if tile.constant { 0 } else { frame })
     }
 
-    /// Counts the `bytes` bytes of one frame of a raw tile as read, unless they were counted before.
+    /// Counts the `bytes` bytes of frame `frame` of a raw tile (plain f32) as read ([`Reader::tiles_read`]), unless
+    /// they were counted before.
     fn count_frame(&self, frames: &mut TileFrames, frame: usize, bytes: usize) {
         if frames.counted != Counted::Tile && frames.counted != Counted::Frame(frame) {
             frames.counted = Counted::Frame(frame);
@@ -198,8 +200,8 @@ impl Reader {
         }
     }
 
-    /// Checks the checksum of a raw tile (plain f32), which is read in chunks into the buffer `chunk`, unless an
-    /// earlier call has checked it. Returns whether this call checked it.
+    /// Checks the checksum of the raw tile (plain f32) at position `index` of the index, unless an earlier call has
+    /// checked it. The tile is read in chunks into the buffer `chunk`. Returns whether this call checked it.
     fn verify_raw(&self, index: usize, tile: &TileRecord, chunk: &mut Vec<u8>) -> Result<bool> {
         if self.verified[index].load(Ordering::Relaxed) {
             return Ok(false);
@@ -240,7 +242,7 @@ impl TouchedPages {
         self.bytes += std::mem::take(&mut other.bytes);
     }
 
-    /// Adds the range of file bytes in which the tile of the record `tile` is stored.
+    /// Adds the range of file bytes in which the tile with the index entry `tile` is stored.
     fn add(&mut self, tile: &TileRecord) {
         self.bytes += u64::from(tile.stored_bytes);
         self.ranges.push(tile.offset..tile.offset + u64::from(tile.stored_bytes));

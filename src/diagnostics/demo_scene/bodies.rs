@@ -9,7 +9,8 @@ use super::motion::{
     BRIGHT, CLOTH_WIDTH, DemoGaussian, DemoMotion, GONE, GaussianRandom, HALF_LIFE, color, facing_y, spread, still,
 };
 
-/// Body of the test scene: a group of Gaussians that form one object and share one property.
+/// Body of the test scene: a group of Gaussians that form one object, such as a wall. Each body has a property that a
+/// compression must handle, such as rigid motion or invisibility.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DemoBody {
     /// Floor and three walls with a checkered texture, without motion. Each square of the texture has one color, so its
@@ -69,7 +70,7 @@ impl DemoBody {
         }
     }
 
-    /// Returns the share of this body in the Gaussians of the scene, in thousandths.
+    /// Returns the number of Gaussians of this body in a scene of 1000 Gaussians.
     const fn share(self) -> usize {
         match self {
             DemoBody::Wall => 400,

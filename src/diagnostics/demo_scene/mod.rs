@@ -114,15 +114,16 @@ impl FrameSource for DemoScene {
     }
 }
 
-/// Reader of those Gaussians of a generated scene that a range or a list of ids selects.
+/// Reader of some Gaussians of a generated scene, selected by a range or a list of ids. It computes their states at
+/// each frame from the formulas of their motion.
 struct Reader<'a> {
     times: &'a [f64],
     parts: Vec<DemoGaussian>,
 }
 
 impl<'a> Reader<'a> {
-    /// Opens a reader of the Gaussians `ids` of the scene that `info` describes. `part` returns the Gaussian with a
-    /// given id.
+    /// Opens a reader of the Gaussians with the ids `ids`. `info` describes the scene: number of Gaussians and times of
+    /// frames. `part` returns attributes and motion of the Gaussian with a given id.
     ///
     /// # Errors
     /// Fails if an id is not less than the number of Gaussians in `info`.

@@ -129,35 +129,37 @@ impl DemoGaussian {
     }
 }
 
-/// Pseudo-random numbers of one Gaussian; the field is the id of the Gaussian. Each number is a hash of this id and of
-/// the index of the number, which is called channel. So the numbers do not depend on the order in which Gaussians are
-/// read.
+/// Source of the pseudo-random numbers of one Gaussian; the field is the id of the Gaussian. A number is a hash of this
+/// id and of an index, called channel. So the numbers do not depend on the order in which Gaussians are read.
 #[derive(Clone, Copy)]
 pub(super) struct GaussianRandom(pub(super) u64);
 
 impl GaussianRandom {
-    /// Returns the pseudo-random number of the Gaussian with the index `channel`, in [0, 1).
+    /// Returns the pseudo-random number with the index `channel` of this Gaussian, scaled to [0, 1). Repeated calls
+    /// with the same `channel` return the same number.
     pub(super) fn unit(self, channel: u64) -> f64 {
         const BITS: u32 = f64::MANTISSA_DIGITS;
         (xxh3_64_with_seed(&self.0.to_le_bytes(), channel) >> (64 - BITS)) as f64 / (1u64 << BITS) as f64
     }
 
-    /// Returns the pseudo-random number of the Gaussian with the index `channel`, in [−1, 1).
+    /// Returns the pseudo-random number with the index `channel` of this Gaussian, scaled to [−1, 1). Repeated calls
+    /// with the same `channel` return the same number.
     pub(super) fn signed(self, channel: u64) -> f64 {
         2.0 * self.unit(channel) - 1.0
     }
 
-    /// Returns the pseudo-random number of the Gaussian with the index `channel`, in [`low`, `high`].
+    /// Returns the pseudo-random number with the index `channel` of this Gaussian, scaled to the range from `low` to
+    /// `high`. Repeated calls with the same `channel` return the same number.
     pub(super) fn between(self, channel: u64, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit(channel)
     }
 }
 
-/// Channel (index of a random number in [`GaussianRandom`]) of the random brightness of a Gaussian's color. Used for
-/// Gaussians of every object; the channels that a single object uses start at 0.
+/// Index of the random number ([`GaussianRandom`]) by which the color of a Gaussian is a little brighter or darker. It
+/// is large because the indices that single objects use for other numbers start at 0.
 const TINT: u64 = 100;
-/// First of the channels (indices of random numbers in [`GaussianRandom`]) of the random view dependence of a
-/// Gaussian's color. Used for Gaussians of every object.
+/// First index of the random numbers ([`GaussianRandom`]) by which the color of a Gaussian depends a little on the view
+/// direction. It is large because the indices that single objects use for other numbers start at 0.
 const SHEEN: u64 = 200;
 
 /// Returns a Gaussian without motion that has the given attributes. `scale`: standard deviations along its axes, scene

@@ -41,8 +41,8 @@ const POLE: DVec3 = DVec3::new(0.75, 1.1, 0.0);
 /// Height of the flagpole, scene units.
 const POLE_HEIGHT: f64 = 2.5;
 
-/// Objects of the scene in the order of the ids of their Gaussians, each with its share in thousandths of all
-/// Gaussians.
+/// Objects of the scene in the order of the ids of their Gaussians, each with its number of Gaussians in a scene of
+/// 1000 Gaussians.
 const SHARES: [(PlaygroundObject, usize); 11] = [
     (PlaygroundObject::Sky, 40),
     (PlaygroundObject::Ground, 330),
@@ -165,7 +165,8 @@ struct SurfacePoint {
     motion: DemoMotion,
 }
 
-/// Returns the `k`-th of the `n` Gaussians of `object`. `dice` is the source of the random numbers of this Gaussian.
+/// Returns Gaussian `k` (from 0) of the `n` Gaussians that form the surface of `object`. Its random numbers come from
+/// `dice`.
 fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     let point = match object {
         PlaygroundObject::Sky => sky(k, n),
@@ -213,9 +214,9 @@ fn sky(k: usize, n: usize) -> SurfacePoint {
 }
 
 fn ground(k: usize, n: usize) -> SurfacePoint {
-    /// Exponent p in the distance of a Gaussian from the center of the ground, `HORIZON` · u^p, where u is spread
-    /// evenly over [0, 1]. With p = 0.5 the Gaussians are spread evenly over the ground; a larger exponent places fewer
-    /// and larger Gaussians far from the center.
+    /// Exponent p that sets how the Gaussians of the ground are spread: their distances from the center are `HORIZON` ·
+    /// u^p, with u evenly spread over [0, 1]. With p = 0.5, Gaussians are equally dense everywhere; a larger p places
+    /// fewer and larger Gaussians far from the center.
     const DENSITY: f64 = 0.8;
     let DVec2 { x: turn, y: part } = spread(k);
     let radius = HORIZON * part.powf(DENSITY);
@@ -365,7 +366,7 @@ struct Limb {
     joint: DVec3,
     swing: f64,
     rgb: [f64; 3],
-    /// Share of this limb in the Gaussians of the figure, in hundredths.
+    /// Number of Gaussians of this limb per 100 Gaussians of the figure.
     share: usize,
 }
 

@@ -1,5 +1,5 @@
-//! Quality of a selection of Gaussians: their renders are compared with renders of the whole model from views that were
-//! not used for ranking or fitting, if there are such views.
+//! Measures how good a selection of Gaussians is: compares its renders with renders of the whole model, from test
+//! views, which were not used for ranking or fitting. A scene without test views is judged from all its views.
 
 use rayon::prelude::*;
 
@@ -58,8 +58,8 @@ impl Judge {
         self.pictures.len()
     }
 
-    /// Renders the Gaussians of `scene` whose ids are in `kept`, and no others, and returns the quality of these
-    /// renders compared with renders of the whole model.
+    /// Renders only the Gaussians of `scene` with the ids `kept`, and compares these renders with those of the whole
+    /// model. Returns their error and PSNR.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.

@@ -84,8 +84,8 @@ impl Knob {
         }
     }
 
-    /// Returns the reason why this knob was not measured, as text for the user: something that the scene or the recipe
-    /// lacks. Each knob has only one possible reason.
+    /// Returns the reason, as text for the user, for which this knob (parameter that `precision` varies) could not be
+    /// measured: something that it needs and the scene or the recipe lacks. There is one possible reason per knob.
     fn needs(self) -> &'static str {
         match self {
             Knob::Sums => "sums over frames need three frames",
@@ -94,7 +94,8 @@ impl Knob {
         }
     }
 
-    /// Returns whether every setting of this knob is measured by a complete run of the program.
+    /// Returns whether the settings of this knob (parameter that `precision` varies) are measured by complete runs of
+    /// the program, from opening the input to the result on disk.
     fn needs_whole_runs(self) -> bool {
         matches!(self, Knob::Merging | Knob::Refining | Knob::Machine)
     }
@@ -137,8 +138,8 @@ const SKETCH_BYTES: u64 = 4 << (9 + MAX_MANTISSA_BITS);
 const HELD_BYTES: u64 =
     (2 * StatisticRows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
 
-/// Data that the measurements of all settings share: the scene, the recipe, the statistics of the scan, and the
-/// conditions of measurement.
+/// Data that the measurements of all settings share: scene, recipe, statistics of the scan, number of Gaussians to
+/// keep, limits on repeated runs, and the folder for results.
 struct Bench<'a> {
     /// Scene, with the training views of at most [`PrecisionOptions::max_frames`] of its frames.
     scene: &'a Scene,
@@ -277,8 +278,10 @@ fn open_with_cameras(input: &InputOptions) -> Result<Scene> {
     Ok(scene)
 }
 
-/// Returns the knobs to vary: those that `options` requests, or all if it requests none. If it requests none and the
-/// model is large, knobs that need complete runs of the program are left out, and `notes` gets a message about this.
+/// Returns the knobs (parameters that `precision` varies) to measure:
+/// - If `options` names knobs, returns these.
+/// - Else returns all knobs. But for a large model it leaves out those that need complete runs of the program, and adds
+///   a message about this to `notes`.
 fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, notes: &mut Vec<String>) -> Vec<Knob> {
     let mut knobs = Knob::ALL.to_vec();
     knobs.retain(|knob| options.knobs.as_ref().is_none_or(|asked| asked.contains(knob)));
@@ -340,10 +343,9 @@ fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     thinned
 }
 
-/// Returns the bytes of memory of the schedule (list of views per frame) that [`thin_frames`] makes for at most `most`
-/// frames. This schedule has two entries for each frame that keeps its views: one for this frame, and one for the
-/// frames without views that follow. Returns 0 if `thin_frames` makes no new schedule, because the input has at most
-/// `most` frames.
+/// Returns the bytes of memory of the new schedule (list of views per frame) that [`thin_frames`] makes for at most
+/// `most` frames. It has two entries for each frame that keeps its views: one for this frame, and one for the frames
+/// without views after it. Returns 0 if the input has at most `most` frames: then there is no new schedule.
 fn thinned_bytes(work: &Workload, most: usize) -> u64 {
     let most = most.max(1) as u64;
     if work.frames <= most { 0 } else { ViewSchedule::bytes(2 * most, work.views) }

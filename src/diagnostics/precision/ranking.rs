@@ -34,20 +34,23 @@ const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
 /// Values that are tried for the number of mantissa bits of the histogram from which percentiles are found.
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MAX_MANTISSA_BITS];
 
-/// Result of a ranking with one setting: value and step size h of the varied parameter, cost, errors, and ids of the
-/// kept Gaussians. An error of order p is proportional to h^p.
+/// Result of a ranking with one value of the varied parameter: `kept`, ids of the kept Gaussians; `cost` (time and
+/// memory), and errors. `step` is a positive number h that states how coarse this value is, as the mesh width of a
+/// numerical method does: for example 1/n for n views, or n for a stride of n. An error of order p is proportional to
+/// h^p.
 struct TriedRanking {
     value: f64,
     step: f64,
     cost: Cost,
-    /// Errors by name. [`Bench::curve`] adds the errors that compare the kept Gaussians with the Gaussians that the
-    /// finest setting keeps.
+    /// Errors of this ranking, by name. Errors that compare `kept` with the Gaussians that the finest setting keeps are
+    /// added later, by [`Bench::curve`].
     errors: BTreeMap<String, f64>,
     kept: Vec<u32>,
 }
 
-/// Recipe of one setting to measure. `value`: value of the varied parameter. `step`: step size h of this value; an
-/// error of order p is proportional to h^p.
+/// One setting to measure: a recipe in which one parameter has the value `value`. `step` is a positive number h that
+/// states how coarse this value is, as the mesh width of a numerical method does: for example 1/n for n views, n for a
+/// stride of n. An error of order p is proportional to h^p.
 struct RankingVariant {
     value: f64,
     step: f64,
@@ -115,10 +118,12 @@ impl Bench<'_> {
         self.repeats.measure_cost(|| self.contributions(recipe), || Ok(()))
     }
 
-    /// Ranks the Gaussians with each of `variants` and with the finest setting. Returns the measurements as the curve
-    /// of the parameter `name`, the finest setting last. The third argument belongs to the finest setting: value and
-    /// step size, contributions measured with this setting, and cost of measuring them. `own`: value of the parameter
-    /// in the recipe.
+    /// Ranks the Gaussians with each of `variants` and with the finest setting. Returns the measurements as a curve,
+    /// the finest setting last.
+    /// - `name`: name of the varied parameter
+    /// - third argument: value and step size of the parameter in the finest setting; contributions of the Gaussians,
+    ///   measured with this setting; cost (time and memory) of measuring them
+    /// - `own`: value of the parameter in the recipe
     fn pass_curve(
         &self,
         name: &str,
@@ -194,8 +199,9 @@ impl Bench<'_> {
     }
 
     /// Ranks the Gaussians in pruning rounds with the parameters `select`, starting from the scores `scored`. Returns
-    /// the kept Gaussians and the cost. `value`: value of the varied parameter. `step`: step size h of this value; an
-    /// error of order p is proportional to h^p.
+    /// the ids of the kept Gaussians and the cost (time and memory), without errors. `value`: value of the varied
+    /// parameter in `select`. `step`: step size h of this value, its coarseness; an error of order p is proportional to
+    /// h^p.
     fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
@@ -249,10 +255,12 @@ impl Bench<'_> {
         })
     }
 
-    /// Returns the rankings `tried` as the curve of the parameter `name`. The last ranking is that of the finest
-    /// setting. Adds the errors of each ranking: its kept Gaussians are compared with those of the last ranking.
-    /// `against`: description of the finest setting. `own`: value of the parameter in the recipe. `expected`: orders of
-    /// convergence that theory predicts, by name of the error.
+    /// Converts the rankings `tried`, the last with the finest setting, to a curve of errors. Adds errors of each
+    /// ranking that come from a comparison of its kept Gaussians with those of the finest setting.
+    /// - `name`: name of the varied parameter
+    /// - `against`: description of the finest setting, for the user
+    /// - `own`: value of the parameter in the recipe
+    /// - `expected`: pairs of the name of an error and the order of convergence that theory predicts for it
     fn curve(
         &self,
         name: &str,
@@ -296,12 +304,13 @@ fn relative_error(count: usize, expected: usize) -> f64 {
     (count as f64 / expected.max(1) as f64 - 1.0).abs()
 }
 
-/// Returns the largest relative error of the percentiles P1 and P99 by which the terms of `scores` are normalized.
-/// `exact` has the correct percentiles. Leaves out the percentiles of the combined scores (static and dynamic):
-/// `scores` and `exact` have different combined scores, so their percentiles are not comparable.
+/// Returns the largest relative error of the percentiles P1 and P99 in `scores`, by which the terms of the scores (such
+/// as motion) are normalized. `exact` holds the correct percentiles. The percentiles of the static and dynamic scores
+/// are left out: these scores combine several terms, so they differ between `scores` and `exact` before any percentile
+/// is taken.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
-    let pairs = pairs.filter(|(term, _)| !matches!(term.of, ScoredQuantity::Static | ScoredQuantity::Dynamic));
+    let pairs = pairs.filter(|(term, _)| !matches!(term.quantity, ScoredQuantity::Static | ScoredQuantity::Dynamic));
     let errors = pairs.flat_map(|(rough, exact)| {
         [(rough.norm.p1, exact.norm.p1), (rough.norm.p99, exact.norm.p99)]
             .map(|(rough, exact)| if exact == 0.0 { 0.0 } else { (rough / exact - 1.0).abs() })

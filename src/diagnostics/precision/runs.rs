@@ -154,9 +154,9 @@ impl Bench<'_> {
         Target::Count(self.kept as u64)
     }
 
-    /// Compresses the input by `recipe` in complete runs of the program. Returns the quality of the result and the
-    /// cost. `value`: value of the varied parameter. `step`: step size h of this value; an error of order p is
-    /// proportional to h^p.
+    /// Compresses the input by `recipe` in complete runs of the program. Returns the error of the result's renders,
+    /// their PSNR, and the cost (time and memory) of the runs. `value`: value of the varied parameter in `recipe`.
+    /// `step`: step size h of this value, its coarseness; an error of order p is proportional to h^p.
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.views.iter().map(|picture| picture.loss.psnr).collect();
@@ -170,10 +170,9 @@ impl Bench<'_> {
         })
     }
 
-    /// Compresses `input` by `recipe` in complete runs of the program, and compares the digest of the result with
-    /// `expected`, the digest of the first setting's result. The call for the first setting gets `None` and stores its
-    /// digest in `expected`. Returns the cost, and 0 as the error if the digests are equal, else 1. `value`: value of
-    /// the varied parameter.
+    /// Compresses `input` by `recipe` in complete runs of the program. Returns the cost (time and memory), and as error
+    /// 0 if the result has the expected digest, 1 if not. `value`: value of the varied parameter. `expected`: digest of
+    /// the result of the first setting; at the call for the first setting it is `None`, and this call sets it.
     fn compare_bytes(
         &self,
         recipe: &Recipe,

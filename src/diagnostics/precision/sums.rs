@@ -1,8 +1,8 @@
 //! Measurement of the rounding errors of the sums that the scan accumulates over frames: in f32, in f32 with
 //! compensation, and in f64 as the program uses it.
 //!
-//! The frames of some Gaussians are played forward and backward again and again, until the errors are large enough to
-//! be seen. The expected sums are computed in f64 with compensation.
+//! The frames of some Gaussians are played forward and backward again and again, for up to 100,000 frames, because
+//! rounding errors grow with the number of terms. The expected sums are computed in f64 with compensation.
 
 use std::collections::BTreeMap;
 
@@ -136,8 +136,9 @@ impl Bench<'_> {
         }))
     }
 
-    /// Computes statistics for each length in [`PLAYED`] by `sums`. Returns, for each length, the errors of these
-    /// statistics and the cost of computing them. `expected`: correct statistics, one entry per length.
+    /// Computes statistics by calling `sums` with each length in [`PLAYED`] (number of frames). Returns, for each
+    /// length, the errors of these statistics and the cost (time and memory) of computing them. `expected`: the correct
+    /// statistics for each length.
     fn measure_lengths(
         &self,
         expected: &[SummedStatistics],

@@ -52,10 +52,10 @@ pub(super) fn needle() -> CaseResult {
     })
 }
 
-/// Compares a proxy of five Gaussians with its members: mean and covariance as in [`mixture`], the SH coefficients with
-/// their weighted mean, and the opacity with 1 − Π(1 − α), where α are the opacities of the members. The members lie
-/// 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13. Returns the largest error,
-/// with the bound that it must not exceed.
+/// Compares a proxy (Gaussian that replaces merged ones) with its five members (the merged Gaussians): mean and
+/// covariance as in [`mixture`], the SH coefficients with their weighted mean, and the opacity with 1 − Π(1 − α), where
+/// α are the opacities of the members. The members lie 1000 units from the origin, where the rounding of f64 changes
+/// their offsets by 1e-13. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn proxy() -> CaseResult {
     CaseResult::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
         let mut states = random_gaussians(4, 5, 1);
@@ -88,8 +88,9 @@ pub(super) fn proxy() -> CaseResult {
 }
 
 /// Merges eight exact copies of a Gaussian, once with each rule of [`ProxyOpacity`]; a ninth copy far away must stay
-/// alone. The proxy must have the position, scales and SH coefficients of the copies to the bit, and the opacity that
-/// the rule gives, in f32. Returns the largest error, with the bound that it must not exceed.
+/// alone. The proxy (Gaussian that replaces the merged ones) must have the position, scales and SH coefficients of the
+/// copies to the bit, and the opacity that the rule gives, in f32. Returns the largest error, with the bound that it
+/// must not exceed.
 pub(super) fn duplicates() -> CaseResult {
     CaseResult::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
         let one = random_gaussians(6, 1, 0);

@@ -164,11 +164,13 @@ pub(super) fn projected_area() -> CaseResult {
     })
 }
 
-/// Compares the contribution C of a needle-shaped Gaussian with a formula for its projected area. The Gaussian has the
-/// variances a and b, in px², along its axes in the image, and these axes are rotated in the image plane. With 0.3 px²
-/// added to both variances, its projected covariance Σ has det Σ = (a + 0.3)(b + 0.3). A computation of det Σ from the
-/// entries of Σ would leave no correct digit. Errors are relative to max(C, 1 px), as in [`projected_area`]. Returns
-/// the largest error, with the bound that it must not exceed.
+/// Compares the contribution C (projected area times opacity, in pixels) of one needle-shaped Gaussian of opacity 0.5
+/// with a closed formula. The Gaussian has the variances a and b, in px², along its axes in the image, and these axes
+/// are rotated in the image plane. With 0.3 px² added to both variances, its projected covariance Σ has det Σ = (a +
+/// 0.3)(b + 0.3), and the area is proportional to √det Σ. The rotated entries of Σ are up to 1e10 px². Computed from
+/// them, det Σ = Σxx·Σyy − Σxy² would be a difference of nearly equal numbers, and lose up to ten of its 16 digits.
+/// Errors are relative to max(C, 1 px), as in [`projected_area`]. Returns the largest error, with the bound that it
+/// must not exceed.
 pub(super) fn needle_on_screen() -> CaseResult {
     CaseResult::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);
@@ -208,9 +210,10 @@ pub(super) fn needle_on_screen() -> CaseResult {
     })
 }
 
-/// Compares the trajectory magnitude D and the curvature κ that a scan computes for one Gaussian with their exact
-/// values, for each pair (from, unit) in `sizes`. The Gaussian starts at x = `from`. In each frame it moves along x by
-/// a whole multiple of `unit`. Both are in scene units. Returns the largest relative error of D and κ.
+/// Scans sequences of one moving Gaussian and compares the trajectory magnitude D and the curvature κ with their exact
+/// values. Each pair in `sizes` gives a sequence: the x coordinate at which the Gaussian starts, and the unit of its
+/// motion along x, in scene units. In each frame it moves by a whole multiple of the unit. Returns the largest relative
+/// error of D and κ over all sequences.
 fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     let mut worst = LargestError::default();
     for &(from, unit) in sizes {
@@ -295,8 +298,8 @@ fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> R
     scan_at(&times, frames, schedule, recipe)
 }
 
-/// Returns the statistics that the scan of the program computes for `frames` at `times`. Tells the scan which frames
-/// have the same opacities as the frame before, as the program's readers of models do.
+/// Returns the statistics that the scan of the program computes for `frames` at the times `times`. Also gives the scan
+/// the hint which frames have the same opacities as the frame before, as readers of models do.
 fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);

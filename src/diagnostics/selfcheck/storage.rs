@@ -99,8 +99,8 @@ pub(super) fn archive_codes() -> CaseResult {
         worst.same(&back.cloud, &expected);
         worst.same(&back.files, &content.files);
         worst.same(&back.tensors.get("a.exact"), &content.tensors.get("a.exact"));
-        let beside: Vec<u8> = order.iter().map(|&id| content.beside[id as usize]).collect();
-        worst.same(&back.beside, &beside);
+        let beside: Vec<u8> = order.iter().map(|&id| content.extra_bytes[id as usize]).collect();
+        worst.same(&back.extra_bytes, &beside);
         Ok(worst)
     })
 }
@@ -123,7 +123,7 @@ fn model() -> (ArchiveContent, QuantizationSteps) {
         content.field.insert(name.to_owned(), role);
     }
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
-    content.beside = (0..content.cloud.len()).map(|i| (i * 7) as u8).collect();
+    content.extra_bytes = (0..content.cloud.len()).map(|i| (i * 7) as u8).collect();
     let matrix_steps = TensorSteps { step: MATRIX_STEP, channels: Vec::new() };
     let field = FieldSteps([("a.matrix".to_owned(), matrix_steps)].into());
     (content, QuantizationSteps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], columns: Vec::new(), field })

@@ -23,10 +23,12 @@ pub enum Replace {
     /// Existing outputs are never replaced.
     #[default]
     Never,
-    /// A file is replaced, whatever it holds: the user named it. In a folder that holds an earlier result, the files
-    /// listed in the summary of that result are replaced. Every other file stays, with `.kept` appended to its name if
-    /// the new result has a file of the same name. A folder without a summary of this program is refused unless it is
-    /// empty.
+    /// A file is replaced, whatever it holds: the user named it. A folder is replaced only if it is empty or has a
+    /// summary of this program (`summary.json`, which lists the files of a result):
+    ///
+    /// - Files that the summary lists are replaced.
+    /// - All other files stay. If the new result has a file of the same name, `.kept` is appended to the name of the
+    ///   old file.
     Existing,
 }
 
@@ -49,8 +51,9 @@ pub(super) enum Destination {
 /// Returns what exists at the path `target`.
 ///
 /// # Errors
-/// Fails with [`Error::Usage`] for sockets, block devices, dangling links, and links that lead through a system folder
-/// to a regular file. This program neither writes nor replaces any of these.
+/// Fails with [`Error::Usage`] for sockets, block devices, dangling links, and links that lead to a regular file
+/// through a link in a system folder, such as `/dev/stdout` if it is redirected to a file. This program neither writes
+/// nor replaces any of these.
 pub(super) fn destination(target: &Path) -> Result<Destination> {
     let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.shown())));
     let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
@@ -75,7 +78,8 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
     }
 }
 
-/// Returns whether `target`, or one of the links that it leads to, lies in a system folder, as `/dev/stdout` does.
+/// Returns whether `target` is a link that lies in a system folder, as `/dev/stdout` does, or leads to such a link.
+/// Such a link must not be replaced.
 fn leads_through_system_link(target: &Path) -> bool {
     let mut link = target.to_owned();
     // Follow at most 40 links, as Linux does.

@@ -107,8 +107,8 @@ pub(super) fn clean_up(target: &Path) {
     }
 }
 
-/// Removes the hidden folders (workspaces) that killed runs left in `folder`, if the names of their outputs end with
-/// `ending`. A workspace that holds an interrupted move of a result stays.
+/// Removes the workspaces (hidden folders in which outputs are written) that killed runs left in `folder`. Only those
+/// of outputs whose names end with `ending` are removed. A workspace that holds an interrupted move of a result stays.
 pub fn remove_leftovers(folder: &Path, ending: &str) {
     let Ok(parent) = FolderHandle::open(folder) else { return };
     for entry in parent.entries().unwrap_or_default() {
@@ -139,11 +139,11 @@ pub(super) fn repair(target: &Path, supersedes: bool) {
     }
 }
 
-/// Locks the unfinished workspace (hidden folder) `name` in the folder `parent` and returns it; returns `None` if that
-/// is not possible. The caller holds the [`PublishLock`].
+/// Locks the workspace (hidden folder) `name` in the folder `parent`, which a killed run left with an interrupted move
+/// of its result, and returns it. Returns `None` if that is not possible. The caller holds the [`PublishLock`].
 ///
-/// If another run holds the lock of this workspace, then either that run created it, has failed and is about to end, or
-/// it inspects the workspace for a moment. So this function waits for up to 5 s ([`MAX_INSPECTION_WAIT`]).
+/// Another run may hold the lock of this workspace: the run that created it and is about to end after a failure, or a
+/// run that inspects it for a moment. So this function tries for up to 5 s ([`MAX_INSPECTION_WAIT`]).
 fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     let start = Instant::now();
     loop {
@@ -155,13 +155,15 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     }
 }
 
-/// Completes or reverts an interrupted move of a result to `target`. The result lies in the workspace `folder`, which
-/// is a subfolder of `parent`. The caller holds the [`PublishLock`].
+/// Completes or reverts an interrupted move of a result to `target`. The result lies in the workspace `folder` (hidden
+/// folder of the killed run), which is a subfolder of `parent`. The caller holds the [`PublishLock`].
 ///
-/// Files listed in a journal get their final names. An earlier result folder that was moved aside gets its name back if
-/// that name is free. Otherwise the new folder is already in place, and entries that the summary of the earlier folder
-/// does not list are moved into the new folder. If they cannot be moved, for example because a folder belongs to
-/// another user, the earlier folder is kept beside the result under a visible name.
+/// - If the workspace holds a journal (list of the files of the result), these files are renamed to their final names.
+/// - If it holds an earlier result folder and nothing has the name of `target`, this folder gets its name back.
+/// - If it holds an earlier result folder and the new one is in place, the foreign entries of the earlier folder (those
+///   that its summary does not list) are moved into the new one, and the rest is discarded.
+/// - If foreign entries cannot be moved, for example because another user owns a folder, the earlier folder stays
+///   beside the result under its name with `.kept` appended.
 pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let (_, name) = split_target(target)?;
     if folder.has(JOURNAL) {
@@ -198,9 +200,9 @@ pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, t
     Ok(())
 }
 
-/// Moves the files of the journal that are still in the workspace `folder` to their final names in the folder `parent`.
-/// Skips names that do not begin with the name of `target`. Fails if the journal cannot be read, or if a file must not
-/// be replaced or cannot be moved.
+/// Moves the files of the journal (list of the files of one result that get their final names together) that are still
+/// in the workspace `folder` to their final names in the folder `parent`. Skips names that do not begin with the name
+/// of `target`. Fails if the journal cannot be read, or if a file must not be replaced or cannot be moved.
 fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
     let (_, name) = split_target(target)?;

@@ -32,8 +32,8 @@ pub(super) enum Owner {
     Listed(BTreeSet<String>),
 }
 
-/// Fields of a summary that declare which files belong to the result. Other fields are skipped without keeping them in
-/// memory.
+/// Fields of a summary that say which files belong to the result: `tool` is the name and version of the program, and
+/// `files` are the paths relative to the summary. Other fields are skipped while the summary is parsed.
 #[derive(Deserialize)]
 struct Declared {
     tool: String,
@@ -65,7 +65,8 @@ impl Owner {
     }
 }
 
-/// Adds the list `files` to the summary file at `path`. Fails if the summary is not a JSON object.
+/// Adds the field `files` with the paths `files` to the summary at `path`, a JSON file that describes a result. Fails
+/// if the summary is not a JSON object.
 pub(super) fn add_file_list(path: &Path, files: &[String]) -> Result<()> {
     let text = fs::read_to_string(path).map_err(Error::io("read back", path))?;
     let found: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
@@ -121,12 +122,16 @@ pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result
     result
 }
 
-/// Appends the paths of the foreign entries in `folder` to `out`. `folder` is the subfolder `inside` of an earlier
-/// result, and the paths are relative to this result. `listed` holds the files of the earlier result; `new` is the
-/// folder of the new result.
+/// Searches `folder`, a folder in the tree of an earlier result, and its subfolders for foreign entries (entries that
+/// do not belong to the earlier result). Appends their paths, relative to the top folder of the earlier result, to
+/// `out`.
+///
+/// - `inside` is the path of `folder`, relative to the top folder of the earlier result.
+/// - `listed` holds the paths of the files that belong to the earlier result.
+/// - `new` is the top folder of the new result.
 ///
 /// Foreign entries are files that are not in `listed`, and folders that contain no file in `listed` and do not exist in
-/// `new`. Subfolders that cannot be read are skipped; the first such failure is returned at the end.
+/// `new`. A subfolder that cannot be read is skipped; the first such error is returned at the end.
 fn find_foreign(
     folder: &FolderHandle,
     new: &Path,
@@ -156,8 +161,9 @@ fn find_foreign(
     result
 }
 
-/// Returns a path below `folder` at which nothing exists: the path `relative`, in which `.kept` is appended to every
-/// component that an existing entry blocks.
+/// Returns the path below `folder` to which a foreign entry with the relative path `relative` is moved. Nothing exists
+/// at this path: `.kept` is appended to the last component if something of this name exists, and to any other component
+/// that exists but is not a folder.
 fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     let mut place = folder.to_owned();
     let mut components = relative.components().peekable();

@@ -13,8 +13,9 @@ use super::warnings::warn;
 use super::workspace::{JOURNAL, REPLACED, Workspace, live_workspaces};
 use crate::error::{Error, Result, ShowPath};
 
-/// Renames files from `workspace` (a hidden folder) to their targets, in the order of `files`. The last file is the
-/// output itself, the others are its companions. The files must have been synced to disk.
+/// Renames files from `workspace` (a hidden folder) to their targets, in the order of `files`. Each element of `files`
+/// is the name in the workspace and the target path. The last file is the output itself, the others are its companions.
+/// The files must have been synced to disk.
 ///
 /// For more than one file, a journal records which files belong together: if the process is killed or fails between two
 /// renames, the next run with this output completes the set.
@@ -47,8 +48,9 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     Ok(())
 }
 
-/// Writes the journal of `workspace`, which holds `replace` and the list of the files to be renamed together, and syncs
-/// it to disk.
+/// Writes a journal into `workspace` (a hidden folder) and syncs it to disk. The journal lists `files`, which are
+/// renamed together: each element is the name in the workspace and the target path. It also holds `replace`, the policy
+/// for existing targets.
 fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let names = files.iter().map(|(content, target)| Ok((content.clone(), split_target(target)?.1.to_owned())));
     let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };

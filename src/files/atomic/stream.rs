@@ -1,4 +1,4 @@
-//! Outputs that are written into a character device or a FIFO.
+//! Writes outputs into character devices and FIFOs, which cannot be replaced like a file.
 
 use std::fs::File;
 use std::io;

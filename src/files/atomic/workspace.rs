@@ -23,8 +23,8 @@ use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_
 use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
-/// Name that takes the place of the output name in the name of a workspace (hidden folder) for a scratch file, because
-/// a scratch file belongs to no output.
+/// Stands for the name of the output in the folder name `.NAME.RANDOM.splatsieve-tmp` of a workspace (hidden folder)
+/// that holds a scratch file. A scratch file belongs to no output, so it has no output name.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
 /// Ending of the names of workspaces (hidden folders in which outputs are written).
 const ENDING: &str = ".splatsieve-tmp";
@@ -41,13 +41,14 @@ pub(super) const REPLACED: &str = "replaced";
 pub(super) const DISCARDED: &str = "discarded";
 /// Name, in the workspace, of the journal: the list of files of one result that get their final names together.
 pub(super) const JOURNAL: &str = "journal";
-/// Names of the entries of a workspace that must not be deleted with it: an earlier output folder, and a journal. The
-/// next run with the same output restores the earlier folder, or completes or reverts the moves in the journal.
+/// Names of the entries of a workspace that must not be deleted with it: an earlier output folder, and a journal (list
+/// of files that get their final names together). The next run with the same output restores the earlier folder, or
+/// completes or reverts the moves in the journal.
 const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 
-/// Paths of the workspaces (hidden output folders) of this process, with the identity of each folder. A thread that
-/// moves a result to its final name holds the lock of this table, so that a signal is handled either before or after
-/// the move.
+/// Table of the workspaces (hidden output folders) of this process: path and identity of each folder. A thread locks
+/// the table while it moves a result to its final name, so that a signal handler runs before or after the move, not
+/// during it.
 static LIVE_WORKSPACES: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
 /// Locks the table of the hidden output folders (workspaces) of this process and returns it: the identity of each
@@ -119,7 +120,8 @@ impl Workspace {
         self.folder.join(CONTENT)
     }
 
-    /// Returns whether the workspace holds an earlier folder or a journal, which must not be deleted with it.
+    /// Returns whether the workspace holds an earlier output folder, or a journal of files to be renamed. Both are
+    /// needed to repair an interrupted move of a result, so such a workspace must not be deleted.
     fn is_unfinished(&self) -> bool {
         UNFINISHED.iter().any(|name| exists(&self.folder.join(name)))
     }
@@ -154,8 +156,8 @@ pub(super) fn publishing_name(name: &OsStr) -> OsString {
 }
 
 /// Returns whether the workspace `folder` holds traces of an interrupted run: the previous output folder, set aside
-/// while it was being replaced, or a journal of moves. The previous folder must be restored, or the moves completed or
-/// reverted, before the workspace is removed.
+/// while it was being replaced, or a journal (list of files that get their final names together). The previous folder
+/// must be restored, or the moves completed or reverted, before the workspace is removed.
 pub(super) fn is_unfinished(folder: &FolderHandle) -> bool {
     UNFINISHED.iter().any(|name| folder.has(name))
 }
@@ -168,7 +170,8 @@ pub(super) fn is_workspace(entry: &OsStr, name: &OsStr) -> bool {
     random.is_some_and(|random| !random.is_empty() && random.iter().all(u8::is_ascii_alphanumeric))
 }
 
-/// Returns the name of the output that the workspace called `entry` is for; `None` if `entry` is not a workspace name.
+/// Returns the name of the output that is written in a workspace (hidden folder), given the folder name `entry` of this
+/// workspace. Returns `None` if `entry` is not the name of a workspace.
 pub(super) fn target_name(entry: &OsStr) -> Option<&str> {
     hidden_name(entry, ENDING)
 }
@@ -179,11 +182,12 @@ fn hidden_name<'a>(entry: &'a OsStr, ending: &str) -> Option<&'a str> {
     Some(name.rsplit_once('.')?.0)
 }
 
-/// Translates a path in a workspace (hidden folder) into the path that the user gave: the output path, or a file in the
-/// output folder.
+/// Translates `path`, a path in a workspace (hidden folder), into a path that the user knows, and returns whether it
+/// was the path of a scratch file:
 ///
-/// For a scratch file, whose name the user does not know, returns the folder that contains it and `true`. Returns
-/// `None` for paths outside workspaces.
+/// - for an output: the output path that the user gave, or a file in the output folder, and `false`
+/// - for a scratch file: the folder that contains the workspace, and `true`
+/// - for a path outside workspaces: `None`
 pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     let mut parts = path.components();
     let mut before = PathBuf::new();
@@ -207,8 +211,8 @@ pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     Some((before, false))
 }
 
-/// Guard that keeps all threads of this process from creating, publishing and removing outputs as long as it exists;
-/// see [`remove_unfinished`].
+/// Guard returned by [`remove_unfinished`] when the process is about to end. As long as it exists, no thread of this
+/// process can create, publish or remove an output.
 #[must_use = "runs go on as soon as this is dropped"]
 pub struct ExitGuard(
     #[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>>,
@@ -238,8 +242,8 @@ pub fn remove_unfinished() -> ExitGuard {
     ExitGuard(live)
 }
 
-/// Creates and locks the lock file in the new folder `folder` and writes the marker line. Returns `None` if another run
-/// mistook the folder for a leftover of a killed run and is removing it.
+/// Claims the new folder `folder` as a workspace: creates a lock file in it, locks the file and writes the line
+/// [`LOCK_LINE`]. Returns `None` if another run mistook the folder for one of a killed run and is removing it.
 fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     let lost = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),
@@ -273,12 +277,14 @@ pub(super) struct Leftover {
     lock: File,
 }
 
-/// Reason why a workspace may not be treated as left over from a killed run.
+/// Reason why [`Leftover::take`] does not take a workspace (hidden output folder): it may still be in use, or it is not
+/// a folder that a killed run of this program left.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refusal {
     /// The run that created the workspace is still alive, or another run is inspecting the workspace.
     Busy,
-    /// The folder is gone, or this program did not create it for this user.
+    /// The folder no longer exists, belongs to this process or to another user, was not created by this program, or its
+    /// lock file cannot be locked.
     Foreign,
 }
 
@@ -327,8 +333,9 @@ impl Leftover {
     }
 }
 
-/// Removes the workspace at `folder` if the folder there still has the identity `identity`. `lock` is its lock file;
-/// `None` on a file system without locks.
+/// Removes the workspace (hidden output folder) at the path `folder`, but only if the folder at this path still has the
+/// identity `identity`: another folder may have taken its place. `lock` is its lock file; `None` on a file system
+/// without locks.
 fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
     let Ok((parent, name)) = split_target(folder) else { return };
     let Ok(parent) = FolderHandle::open(&parent) else { return };

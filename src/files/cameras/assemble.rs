@@ -158,12 +158,12 @@ impl Assembly {
         Ok(())
     }
 
-    /// Returns the largest time stamp of the images added so far, or `least` if that is larger.
+    /// Returns the largest time stamp of the images added so far, but at least `least`.
     pub(super) fn latest(&self, least: f64) -> f64 {
         self.rig.shots.iter().filter_map(|shot| shot.time).fold(least, f64::max)
     }
 
-    /// Divides the time stamps of all images by `span`.
+    /// Divides the time stamps of all images by `span`, the largest time stamp, so that times run up to 1.
     pub(super) fn divide_times(&mut self, span: f64) {
         for shot in &mut self.rig.shots {
             shot.time = shot.time.map(|time| time / span);
@@ -236,8 +236,8 @@ impl MemoryCounter {
     }
 }
 
-/// Returns the error text for an image that has a time although the first image has none, or the reverse. `timed` says
-/// whether the first image has a time.
+/// Returns what an error message says was found if only some images of a data set have a time: an image differs from
+/// the first image in this respect. `timed` says whether the first image has a time.
 fn time_mismatch(timed: bool) -> &'static str {
     if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }
@@ -292,8 +292,8 @@ fn camera_bits(camera: &Camera) -> [u64; 18] {
     bits
 }
 
-/// Builds a camera from a camera-to-world pose (`rotation`, camera position `center`) in OpenCV axes. The second
-/// argument holds fx, fy, cx, cy in pixels.
+/// Builds a camera from a camera-to-world pose in OpenCV axes. The arguments are, in this order: image width and height
+/// in pixels; fx, fy, cx, cy in pixels; the camera-to-world rotation; the camera position.
 pub(super) fn from_camera_to_world(
     (width, height): (u32, u32),
     [fx, fy, cx, cy]: [f64; 4],

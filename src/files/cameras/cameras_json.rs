@@ -111,8 +111,8 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     assembly.finish(None, origin)
 }
 
-/// Converts `own`, the entry of one camera in a file of the 3DGS format, to an entry of the image list: its camera,
-/// image file and view number. The time is not set.
+/// Builds a list entry of one image from `own`, the JSON object of one camera in a `cameras.json` of 3DGS. The list
+/// entry holds the camera, the path of the image file and the view number, but no time.
 fn per_camera(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let size @ (width, height) = (own.side("width")?, own.side("height")?);
     let intrinsics = [own.number("fx")?, own.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];

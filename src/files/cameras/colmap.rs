@@ -27,11 +27,11 @@ use crate::model::{Camera, Rig, Split};
 const MAX_NAME_BYTES: u64 = 4096;
 /// Bytes of one 2D point in an image entry: two coordinates (f64) and the number of the 3D point (u64).
 const POINT_BYTES: u64 = 24;
-/// Bytes of memory per camera in the table of cameras. While the table grows, the old one and a copy of twice the size
-/// exist.
+/// Bytes of memory to count per camera. When the table of cameras grows, it is copied to a table of twice the size, and
+/// both exist for a moment. So this is 4 times the size of an entry.
 const LENS_BYTES: u64 = 4 * size_of::<(u32, Lens)>() as u64;
-/// Bytes of memory per image in the list of images, without its name. While the list grows, the old one and a copy of
-/// twice the size exist.
+/// Bytes of memory to count per image, without its name. When the list of images grows, it is copied to a list of twice
+/// the length, and both exist for a moment. So this is 3 times the size of an element, and 160 bytes in addition.
 const IMAGE_BYTES: u64 = 3 * size_of::<ColmapImage>() as u64 + 160;
 /// Maximum difference between 1 and the length of the quaternion of a rotation.
 const UNIT_TOLERANCE: f64 = 1e-3;
@@ -187,8 +187,9 @@ fn scale_intrinsics(
     (requested, [fx * x, fy * y, cx * x, cy * y])
 }
 
-/// Builds a camera from the `name` of its COLMAP camera model, the image size in pixels and the parameters `values` of
-/// the model. `wrong` builds an error from the expected and the found value.
+/// Builds a camera from an entry of COLMAP's `cameras` file: the name `name` of the camera model, the image width and
+/// height in pixels, and the parameters `values` of the camera model. `wrong` receives the expected and the found value
+/// and builds an error from them.
 ///
 /// # Errors
 /// Fails if the camera model is unknown or has distortion, if the number of `values` is not the number of parameters of

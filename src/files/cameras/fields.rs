@@ -1,4 +1,5 @@
-//! Typed access to the keys of one JSON object, with errors that name the image and the key.
+//! Reads values of expected types (numbers, texts, vectors, matrices) from one JSON object of a camera file. Errors
+//! name the image and the key.
 
 use std::path::Path;
 

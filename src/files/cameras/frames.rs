@@ -1,4 +1,4 @@
-//! Data sets with one COLMAP folder `colmap_K` for each frame, as SpacetimeGaussians prepares them.
+//! Finds the images of data sets with one COLMAP folder `colmap_K` for each frame, as SpacetimeGaussians prepares them.
 //!
 //! The cameras do not move: every frame has the cameras of `sparse/0` in the first folder, as in the loader of
 //! SpacetimeGaussians. Frame j of n is at time j/n; its images are in the folder with the number K + j, where K is the
@@ -42,9 +42,13 @@ pub(super) fn count(root: &Path, first: u32) -> usize {
     (first..=u32::MAX).take_while(|k| root.with_file_name(format!("{PREFIX}{k}")).is_dir()).count()
 }
 
-/// Returns the images of `frames` frames, each with the cameras of the first frame. `images` are the images of the
-/// first frame, whose folder `root` is called `colmap_K` with K = `first`. The folder of each later frame has the next
-/// number. The first image of each frame is a test image.
+/// Returns the images of all frames of a data set with one folder `colmap_K` per frame. There are `frames` frames, each
+/// with the cameras of the first frame.
+///
+/// - `images` are the images of the first frame.
+/// - `root` is the folder `colmap_K` of the first frame, and `first` its number K. The folder of each later frame has
+///   the next number.
+/// - The first image of each frame is a test image.
 pub(super) fn repeat_for_frames<'a>(
     images: &'a [ListedImage],
     (root, first): &'a (PathBuf, u32),

@@ -1,4 +1,5 @@
-//! Streaming access to the list of images in a JSON camera file, and access to the keys outside this list.
+//! Reads a JSON camera file, which may be large, in two passes: [`outline`] reads everything except the list of images,
+//! and [`each_image`] calls a function for one image after another.
 
 use std::path::Path;
 
@@ -7,7 +8,8 @@ use crate::files::json::lists::{ListSelection, each_element};
 use crate::files::json::small::{Keep, SmallValue};
 use crate::files::json::{ParseAbort, read};
 
-/// Keys by which the format of a camera file is recognized, and keys that hold for all images of the file.
+/// Keys that [`outline`] reads: keys that show in which format the camera file is, and keys whose values hold for all
+/// images of the file.
 const OUTLINE_KEYS: [&str; 14] = [
     "frames",
     "w2c",
@@ -24,7 +26,8 @@ const OUTLINE_KEYS: [&str; 14] = [
     "background",
     "rotation",
 ];
-/// Maximum number of elements kept of each list. A background color has three.
+/// Maximum number of elements of each list that are kept in memory. The longest list that is needed, a background
+/// color, has three.
 const MAX_ELEMENTS: usize = 4;
 
 /// Reads the JSON document in `file` without its images: of each list, only the length and the first 4 elements are

@@ -4,7 +4,7 @@
 //! right and backward axes in the world, its position, and (height, width, focal length) in pixels of the original
 //! images. Images are used at half this size unless `--resolution` gives another; the focal length is scaled with the
 //! width. The principal point is the middle of the image. Camera 0 is the test camera. Every camera sees every frame.
-//! Frame i of n is at time i/n, so time 1 is never reached (see FORMATS: the DyNeRF loader of 4DGaussians).
+//! Frame i of n is at time i/n, so time 1 is never reached, as in the DyNeRF loader of 4DGaussians.
 
 use std::io::{BufReader, Read, Seek};
 use std::path::Path;

@@ -53,12 +53,13 @@ pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<
     assembly.finish(None, shown_name(file))
 }
 
-/// Values of one key, by frame and camera.
+/// Table of the values of one key, by frame and camera. The values of all frames are in one list; frames may have
+/// different numbers of cameras.
 #[derive(Debug)]
 struct KeyedValues<T> {
     /// Values of all frames, one frame after another.
     values: Vec<Option<T>>,
-    /// For each frame, the index in `values` after its last value.
+    /// For each frame, the index in `values` of the element after the last value of this frame.
     ends: Vec<usize>,
 }
 
@@ -66,8 +67,8 @@ impl<T> KeyedValues<T> {
     /// Table without any frames.
     const EMPTY: KeyedValues<T> = KeyedValues { values: Vec::new(), ends: Vec::new() };
 
-    /// Bytes of memory to count for one more value. A list that grows is copied to twice its length, so three times the
-    /// size of a value may be in use.
+    /// Bytes of memory to count per value of a table. When the list of values grows, it is copied to a list of twice
+    /// the length, and both exist for a moment. So this is 3 times the size of a value.
     const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
 
     /// Returns the index in `values` of the first value of frame `frame`.
@@ -111,8 +112,8 @@ impl Tables {
         Ok(())
     }
 
-    /// Records that the list of the current frame under the key `KEYS[key]` is complete: later values belong to the
-    /// next frame.
+    /// Ends the current frame in the table of the key `KEYS[key]`, because the JSON list of this frame is complete.
+    /// Values added afterwards belong to the next frame.
     fn end(&mut self, key: usize) {
         match key {
             0 => self.intrinsics.ends.push(self.intrinsics.values.len()),

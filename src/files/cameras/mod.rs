@@ -69,7 +69,7 @@ const NERFIES: &str = "dataset.json";
 /// Paths, relative to a data set, at which a COLMAP reconstruction is searched for.
 const COLMAP: [&str; 6] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "images.bin", "images.txt"];
 
-/// Settings supplied by the caller for values that a camera file may lack.
+/// Options for reading cameras: values that are used where a camera file does not state them, and the memory limit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CameraOptions {
     /// Image (width, height) in pixels, used if the camera file states no size and the size of the image file cannot be
@@ -142,11 +142,10 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     }
 }
 
-/// Searches for the camera file with which a model was trained. `source_path` is the path of the data set in the
-/// configuration of the model.
-///
-/// A relative path is tried from the working folder, then from each parent folder of the model folder, the nearest
-/// first. Returns `None` when no camera file is found; never fails.
+/// Searches for the data set whose cameras a model was trained with, and returns its path. `source_path` is the path of
+/// the data set in the configuration of the model. If it is relative, it is tried from the working folder, then from
+/// each parent folder of the model folder `model_folder`, the nearest first. The first path at which there is a camera
+/// file is returned, or `None` if there is none. Never fails.
 pub fn find_training_cameras(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
     if source_path.is_empty() {
         return None;

@@ -7,8 +7,8 @@
 //! - The focal length holds along both axes. The principal point is the middle of the image.
 //! - Distortion is ignored, as in that loader.
 //! - The time of an image is its `warp_id` divided by the largest `warp_id`.
-//! - Images in `val_ids` are test images. If `val_ids` is empty, every fourth image, from the first on, is for
-//!   training, and the image two after each training image but the last is a test image.
+//! - Images in `val_ids` are test images. If `val_ids` is empty, images 0, 4, 8, … are training images, and images 2,
+//!   6, 10, … are test images if a training image follows.
 //! - Images are those of `rgb/2x`, half the size in the camera files, unless `--resolution` gives another.
 
 use std::path::Path;

@@ -64,8 +64,8 @@ fn per_image(times: &[f64]) -> Value {
     json!({"background": [1, 0.5, 0], "frames": times.iter().map(frame).collect::<Vec<_>>()})
 }
 
-/// Returns the bytes of an array file in NumPy's format 1.0 with the values `rows`. The first three arguments are the
-/// values of `descr`, `fortran_order` and `shape` in its header.
+/// Returns the bytes of a NumPy array file (format 1.0) with the values `rows`. The other arguments are texts for its
+/// header: the values of `descr`, `fortran_order` and `shape`.
 fn npy(dtype: &str, order: &str, shape: &str, rows: &[[f64; 17]]) -> Vec<u8> {
     let header = format!("{{'descr': '{dtype}', 'fortran_order': {order}, 'shape': {shape}, }}");
     let mut bytes = b"\x93NUMPY\x01\0\x76\0".to_vec();

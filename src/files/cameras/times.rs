@@ -15,8 +15,8 @@ use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::text::TextLines;
 
-/// Bytes of memory per entry of the time table, without its name. While the table grows, the old one and a copy of
-/// twice the size exist.
+/// Bytes of memory to count per entry of the time table, without its name. When the table grows, it is copied to a
+/// table of twice the size, and both exist for a moment.
 const TABLE_ENTRY_BYTES: u64 = 3 * 40 + 32;
 
 /// Source of the times of images.
@@ -55,8 +55,9 @@ impl TimesSource {
     }
 }
 
-/// Returns two values: the time of each image in `names`, which the camera file `file` lists, and a text that describes
-/// where these times come from. Both are empty if there are no times. `times` names the source of the times.
+/// Finds the times of images. `names` are the names of the images in the camera file `file`, and `times` says where the
+/// times come from (for example, image names or a table). Returns the time of each image, and a text that describes for
+/// the user where the times come from. Both are empty if the images have no times.
 ///
 /// # Errors
 /// Fails if an image name contains no number although its number is needed, or if the table of times is malformed or

@@ -32,8 +32,9 @@ const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)
 const IMAGE_KEYS: [&str; 11] =
     ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
 
-/// Reads the cameras in `file`. If `with_others` is set (the user named the folder), also reads the files of the other
-/// splits beside it. Otherwise those files only contribute to the largest time, by which times are divided.
+/// Reads the cameras in `file`, the `transforms*.json` of one split (training, validation or test). The files of the
+/// other splits may lie beside it. If `with_others` is true (the user named the folder), their cameras are read, too.
+/// If it is false, these files only contribute to the largest time, by which all times are divided.
 pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> Result<Rig> {
     let mut files = vec![file.to_owned()];
     let mut latest = 0.0;

@@ -9,7 +9,7 @@ use crate::model::{Camera, Rig, Shot, Split};
 /// cameras.
 const CAMERAS: u32 = 12;
 /// Distance of the cameras from the center, as a multiple of the extent of the scene. With a field of view of 60° the
-/// image then spans 2.3 extents, so that a scene with equal sides is seen whole from every corner.
+/// image then spans 2.3 extents, so a cube-shaped scene fits into the image even when seen from a corner.
 const DISTANCE: f64 = 2.0;
 /// Horizontal field of view in degrees of the cameras around a moving scene.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
@@ -45,26 +45,29 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
     }
 }
 
-/// Number of cameras around a still (model without motion); enough that every part of the surface is seen at more than
-/// a grazing angle from some camera.
+/// Number of cameras around a still (model without motion). With 24 evenly distributed cameras, every part of the
+/// surface is seen by some camera at more than a grazing angle.
 const SURROUNDING_CAMERAS: u32 = 24;
 /// Distance of the cameras around a still from its center, as a multiple of the radius of its visible surface.
 const SURROUNDING_DISTANCE: f64 = 2.2;
-/// Field of view in degrees of the cameras around a still; the still nearly fills the image.
+/// Field of view in degrees of the cameras around a still (model without motion). A sphere with the radius of its
+/// visible surface nearly fills the image.
 const SURROUNDING_FIELD_OF_VIEW_DEGREES: f64 = 49.0;
 /// Image width and height in pixels, for the cameras around a still.
 const SURROUNDING_SIDE_PX: u32 = 320;
-/// Fraction that defines the radius of a still: Gaussians with this fraction of the total weight (visible area) lie
-/// within the radius. Gaussians further away, mostly floaters and ground, are seen only where they are in front.
+/// Fraction that defines the radius of a still (model without motion): Gaussians with 9/10 of the total visible area
+/// lie within this radius of the center. Most Gaussians outside are floaters and ground.
 const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 
-/// Returns cameras on a Fibonacci sphere around most of the visible surface of a still (model without motion), all as
-/// training views.
+/// Returns cameras around the visible surface of a still (model without motion), evenly distributed on a Fibonacci
+/// sphere. All of them are training views.
 ///
-/// The center is the weighted median of `positions` for each axis. The radius is the distance within which nine tenths
-/// of the weight lie. `weights` holds the visible area of each Gaussian: opacity times the product of its two larger
-/// scales. Weights above the 99th percentile are set to that percentile. The weights make floaters, which are many
-/// and thin, count little. The limit of the weights keeps a backdrop of few huge Gaussians from dominating.
+/// - `weights` holds the visible area of each Gaussian: its opacity times the product of its two larger scales. So
+///   floaters, which are many and thin, count little. Weights above the 99th percentile are set to it, so that a
+///   backdrop of few huge Gaussians does not dominate.
+/// - The center of the sphere is the weighted median of `positions`, separately for x, y and z.
+/// - The radius of the surface is the distance from the center within which nine tenths of the weight lie. The sphere
+///   has 2.2 times this radius.
 pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
     let mut all: Vec<(DVec3, f64)> = positions
         .iter()

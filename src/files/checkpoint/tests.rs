@@ -35,8 +35,9 @@ fn ramp(n: usize) -> Vec<f32> {
     (0..n).map(|i| i as f32 + 0.5).collect()
 }
 
-/// Returns a pair of dicts for the tests. It contains tensors of four rows, one of them a transposed parameter, a
-/// tensor whose rows are not Gaussians, two tensors that share a storage (block of values), a mask and other values.
+/// Returns a tuple of two dicts to be written as a checkpoint. They contain tensors with one row for each of four
+/// Gaussians (one of them is a transposed parameter, two share a storage, which is a block of values), a tensor without
+/// Gaussians, a mask, and values that are not tensors.
 fn model() -> PythonValue {
     let transposed = PickledTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
     let [first, second] =
@@ -105,8 +106,8 @@ fn every_float_type_is_converted_to_f32() {
     }
 }
 
-/// Checks the error for a file in the format before PyTorch 1.6. The test bytes are the start of a file that
-/// `torch.save(…, _use_new_zipfile_serialization=False)` writes.
+/// Checks that a checkpoint in the format of PyTorch before 1.6 is refused with a message that says how to convert it.
+/// The test bytes are the start of a file that `torch.save(…, _use_new_zipfile_serialization=False)` writes.
 #[test]
 fn files_of_old_pytorch_are_refused_with_the_way_out() {
     let start = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.";

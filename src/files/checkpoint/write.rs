@@ -23,19 +23,21 @@ use crate::files::zip_output::ZipOutput;
 /// Alignment of the contents of each file in the archive, in bytes, as in PyTorch.
 const ALIGNMENT: u16 = 64;
 
-/// Tensor with one row per Gaussian, and the changes to its rows.
+/// Tensor with one row per Gaussian, and the rows of it that get new values in the copy of the checkpoint.
 #[derive(Debug)]
 pub(crate) struct GaussianRows {
     /// Tensor in the original checkpoint.
     pub(crate) tensor: TensorView,
-    /// Indices, among the rows that are written, of the rows whose values change; increasing.
+    /// Indices of the rows that get new values, increasing. They count the rows of the new file, which has only the
+    /// Gaussians that are kept.
     pub(crate) changed: Vec<u32>,
-    /// New values of the changed rows, `[changed, elements of a row]`, last index fastest. If empty, the new values are
-    /// zeros.
+    /// New values of the rows in `changed`, `[rows in changed, elements of a row]`, last index fastest. If empty, these
+    /// rows are set to zeros.
     pub(crate) values: Vec<f32>,
 }
 
-/// Part of a rewritten storage (block of tensor values) that holds one tensor.
+/// Values of one tensor as they are written into a new storage (block of tensor values). A new storage consists of one
+/// part for each tensor that uses it.
 struct StoragePart<'a> {
     tensor: &'a TensorView,
     /// Changes to the rows of the tensor; `None` if all rows are copied unchanged.
@@ -123,9 +125,9 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
 }
 
 impl<'a> StoragePart<'a> {
-    /// Creates the part of a rewritten storage (block of tensor values) that holds `tensor`, and computes the shape and
-    /// strides of this part. The part has `kept` rows, or all rows of the tensor if `rows` is `None`. `offset` is the
-    /// index of the part's first element in the rewritten storage.
+    /// Lays out the values of `tensor` in a new storage (block of tensor values): computes their shape, strides and
+    /// number. `kept` is the number of rows that are kept; if `rows` is `None`, all rows of the tensor are kept.
+    /// `offset` is the index in the new storage of the first value.
     fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {
@@ -162,8 +164,8 @@ impl<'a> StoragePart<'a> {
         StoragePart { tensor, rows, shape, stride, offset, len }
     }
 
-    /// Appends the bytes of this part of the rewritten storage (block of tensor values) to `out`. `stored` holds the
-    /// bytes of the old storage, and `kept` the indices of the rows that are kept.
+    /// Appends the bytes of this tensor for the new storage (block of tensor values) to `out`. `stored` holds the bytes
+    /// of the old storage, and `kept` the indices of the rows of the tensor that are kept.
     fn write(&self, stored: &[u8], kept: &[u32], out: &mut Vec<u8>) {
         let (bytes, start) = (self.tensor.kind.bytes(), out.len());
         out.resize(start + self.len * bytes, 0);
@@ -211,10 +213,10 @@ impl<'a> StoragePart<'a> {
     }
 }
 
-/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`. A tensor that
-/// is a key of `expected` must have the shape, strides and offset given there; every other tensor must have those of
-/// the old pickle. The check fails if two tensors share one shape object in the pickle although only one of them gets a
-/// new shape.
+/// Checks the new pickle `written`: every tensor in `all` must have the right shape, strides and offset in it.
+/// `expected` maps nodes of tensors to their new shape, strides and offset. A tensor that is not in `expected` must be
+/// described as before. The check fails if two tensors share one shape object in the pickle although only one of them
+/// gets a new shape.
 fn check_pickle(
     checkpoint: &Checkpoint,
     written: &[u8],

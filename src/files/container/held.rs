@@ -1,4 +1,5 @@
-//! Decoded tiles of a container that are kept in memory.
+//! Keeps decoded tiles of a container in memory, so that later passes over the frames need not read and decode them
+//! again.
 //!
 //! A tile holds the values of one attribute for a block of consecutive Gaussians and frames. Input: the values of tiles
 //! as they are decoded. Output: the same values, for any thread, as long as the container is open. Memory: at most the
@@ -14,8 +15,8 @@ use crate::error::Result;
 /// Values of one tile; empty until the tile has been decoded.
 type TileSlot = OnceLock<Box<[f32]>>;
 
-/// Number of locks shared by all tiles while tiles are decoded. There are more locks than threads, so that threads
-/// rarely wait for one another.
+/// Number of locks for decoding, shared by all tiles. It is larger than the number of threads, so two threads rarely
+/// need the same lock.
 const LOCKS: usize = 256;
 
 /// Decoded tiles that are kept in memory. Each tile of the file has its own slot, so that readers of a decoded tile
@@ -28,7 +29,8 @@ pub(super) struct HeldTiles {
     capacity: AtomicU64,
     /// Bytes of `capacity` that are not used yet.
     left: AtomicU64,
-    /// Whether a tile did not fit into the remaining bytes. From then on the sizes of further tiles are not looked up.
+    /// Whether a tile has been refused because it did not fit into the remaining memory. While this is set, every
+    /// further tile is refused at once, without looking up its size in the file.
     full: AtomicBool,
 }
 
@@ -54,9 +56,9 @@ impl HeldTiles {
         }
     }
 
-    /// Returns the values of the tile in slot `at`, or `None` if they do not fit into the allowed memory. If the tile
-    /// is not in memory yet, `count` returns its number of values and `decode` writes them. If several threads ask at
-    /// the same time, one decodes and the others wait.
+    /// Returns the values of the tile with the slot number `at`. If they are not in memory yet, decodes and keeps them:
+    /// `count` returns their number, and `decode` writes them into the given buffer. Returns `None` if they do not fit
+    /// into the allowed memory. If several threads need the same tile, one decodes it and the others wait.
     ///
     /// # Errors
     /// Fails if `count` or `decode` fails; the tile is then not kept.

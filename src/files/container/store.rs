@@ -1,5 +1,6 @@
-//! An open container (`gseq` sequence file): its columns (attributes), the decoded tiles that are kept in memory, and
-//! the buffers for decoding. A tile holds the values of one attribute for a block of consecutive Gaussians and frames.
+//! Opens containers (`gseq` sequence files). An open container has columns (attributes), decoded tiles that are kept in
+//! memory, and buffers for decoding. A tile holds the values of one attribute for a block of consecutive Gaussians and
+//! frames.
 
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
@@ -33,11 +34,11 @@ pub struct Container {
 pub(super) struct TileScratch {
     pub(super) buffer: TileBuffer,
     pub(super) frames: TileFrames,
-    /// Values of one frame of the tile.
+    /// Values of one frame of a tile, between decoding and copying them to the caller.
     pub(super) plane: Vec<f32>,
 }
 
-/// [`TileScratch`] in use by a thread; returned to the container when dropped.
+/// Decoding buffers that a thread has borrowed from the container. Dropping this value gives them back.
 pub(super) struct ScratchGuard<'a> {
     from: &'a Mutex<Vec<TileScratch>>,
     scratch: TileScratch,
@@ -146,8 +147,8 @@ impl Container {
         4 * self.places.iter().map(values).sum::<u64>() + self.slots() as u64 * HeldTiles::BYTES_PER_SLOT
     }
 
-    /// Returns the number of slots for decoded tiles, one for each tile of the file. A column (attribute) that does not
-    /// vary over time has tiles in only one frame block.
+    /// Returns the number of tiles in the file, each of which has a slot for its decoded values. A column (attribute)
+    /// that does not vary over time has tiles in only one frame block.
     pub(super) fn slots(&self) -> usize {
         self.slot(self.places.len(), 0, 0)
     }
@@ -165,10 +166,12 @@ impl Container {
         (before + if varies { frame_block as usize } else { 0 }) * blocks + gaussian_block as usize
     }
 
-    /// Returns the decoded values of the tile `at`, `[frames, width, len]`: the frames of the tile, the components of
-    /// its attribute, the Gaussians of the tile. A tile whose values are constant over time has one frame. `index` is
-    /// the index of the attribute in [`Container::places`]. Returns `None` if the values are not in memory and do not
-    /// fit into the memory allowed for kept tiles.
+    /// Returns the decoded values of the tile `at`, as `[frames, width, len]`: the frames of the tile, the components
+    /// of its attribute, the Gaussians of the tile. A tile whose values are constant over time has one frame. `index`
+    /// is the index of the attribute in [`Container::places`].
+    ///
+    /// Decodes the tile if its values are not in memory yet, and keeps them. Returns `None` if they do not fit into the
+    /// memory allowed by [`Container::hold_decoded`].
     ///
     /// # Errors
     /// Fails if the tile cannot be read or decoded.

@@ -89,8 +89,8 @@ impl BlockReader for EncodingReader<'_> {
     }
 }
 
-/// Returns five selections of Gaussians: one tile, the short last tile, a part of a tile, parts of two tiles, and
-/// `scattered` Gaussians in no order.
+/// Returns five selections of Gaussians to be read in tests: all of one tile, all of the last tile (which is shorter),
+/// some of one tile, some of two adjacent tiles, and the Gaussians `scattered` in any order.
 fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
     let tile = GAUSSIAN_BLOCK;
     [

@@ -10,12 +10,12 @@ use crate::error::{Error, Result, ShowPath};
 use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
-/// Maximum number of bytes of the memory-mapped file that a reader touches before it releases the pages that it no
-/// longer needs.
+/// Number of bytes of decoded tiles in the memory-mapped file that a reader may have read before it releases their
+/// pages.
 const MAX_TOUCHED_BYTES: u64 = 1 << 20;
 
-/// `len` Gaussians that are adjacent both in a tile and in the reader's list of Gaussians. The first has index `from`
-/// in the tile and index `to` in the list.
+/// Run of `len` Gaussians that are adjacent both in a tile and in the reader's list of Gaussians. `gaussian_block` is
+/// the index of the tile's Gaussian block. The first Gaussian has index `from` in the tile and index `to` in the list.
 struct TileRun {
     gaussian_block: u32,
     from: usize,
@@ -26,8 +26,9 @@ struct TileRun {
 /// Values of one column (attribute) that a reader keeps in memory.
 pub(super) enum KeptColumn {
     Nothing,
-    /// Index of a frame block, and the values of its tile, which holds exactly the reader's Gaussians. The values have
-    /// been decompressed, or are raw (uncompressed) in the file.
+    /// All frames of one tile. The first field is the index of the frame block of the tile. This variant is used only
+    /// if the tile holds exactly the reader's Gaussians. The values are decompressed, or raw (uncompressed) in the
+    /// mapped file.
     Tile(u32, TileFrames),
     Values(FrameValues),
 }
@@ -55,18 +56,17 @@ impl FrameValues {
     }
 }
 
-/// Reader of some Gaussians of a container.
+/// Reader of some Gaussians of a container, frame by frame. It keeps decoded values in memory, so that a tile is not
+/// decoded again for the next frame.
 ///
-/// Memory in bytes per Gaussian, for each column (attribute) that varies over time:
+/// Memory in bytes per Gaussian and column (attribute), where width is the number of components of the column:
 ///
-/// - 4 × width × frames kept, where width is the number of components. The frames kept are the frames of one frame
-///   block that the read plan lists, but at most the number given by [`ReadPlan::with_max_kept_frames`].
-/// - 8 × width in addition, if a whole frame block is kept.
-/// - Raw (uncompressed) tiles that are read whole take mapped memory instead. It has the same size if a whole frame
-///   block may be kept, and is 0 otherwise.
-///
-/// No memory is used if only one frame is kept, for columns that do not vary, and for tiles that the container keeps in
-/// memory.
+/// - 4 × width × frames kept. The frames kept are the frames of one frame block that the read plan lists, but at most
+///   the number given by [`ReadPlan::with_max_kept_frames`].
+/// - 8 × width in addition, if all frames of a frame block are kept.
+/// - For a raw (uncompressed) tile that is read whole: mapped memory of the same size if all frames of a frame block
+///   may be kept, else 0.
+/// - 0 if only one frame is kept, if the column does not vary over time, or if the container itself keeps the tile.
 pub(super) struct TileReader<'a> {
     source: &'a Container,
     len: usize,
@@ -75,7 +75,8 @@ pub(super) struct TileReader<'a> {
     pub(super) whole: bool,
     /// Numbers of the frames that will be read.
     plan: ReadPlan,
-    /// Last frame block for which the operating system was told which tiles will be read next.
+    /// Index of the last frame block for which the operating system was told which tiles of the file will be read next,
+    /// so that it reads them ahead.
     announced_block: Option<u32>,
     /// For each column (attribute), the values that this reader keeps in memory, in the order of [`Container::places`].
     pub(super) kept: Vec<KeptColumn>,
@@ -83,7 +84,7 @@ pub(super) struct TileReader<'a> {
     entered: u32,
     /// Mapped pages of raw (uncompressed) tiles in use, to be released when another frame block is entered.
     raw_in_use: TouchedPages,
-    /// Mapped pages of tiles that have been decoded, to be released soon.
+    /// Mapped pages of tiles that have been decoded. They are released when they exceed 1 MiB ([`MAX_TOUCHED_BYTES`]).
     decoded: TouchedPages,
 }
 
@@ -127,8 +128,9 @@ impl<'a> TileReader<'a> {
         (frame / self.source.reader.layout().frame_block as usize) as u32
     }
 
-    /// Writes the values of an attribute at frame `frame` to `out`, `[width, len]`: the components of the attribute,
-    /// the reader's Gaussians. `index` is the index of the attribute in [`Container::places`].
+    /// Reads one attribute of the Gaussians of this reader at frame `frame` into `out`. `out` has the shape `[width,
+    /// len]`: one row per component of the attribute, one column per Gaussian. `index` is the index of the attribute in
+    /// [`Container::places`].
     fn read_column(&mut self, index: usize, frame: usize, out: &mut [f32]) -> Result<()> {
         if !self.try_keep(index, frame)? {
             return self.decode(index, &[frame], out);
@@ -148,11 +150,11 @@ impl<'a> TileReader<'a> {
     }
 
     /// Tries to decode the attribute with index `index`, for `frame` and later frames of its frame block, into the
-    /// memory of this reader. Returns whether this reader now has the values of `frame` in memory.
+    /// memory of this reader. Returns whether the values of `frame` are now in the memory of this reader.
     ///
-    /// Returns false if keeping the values would not save work, for example because the container itself keeps the
-    /// tiles, or because only one frame is needed. The caller then uses [`TileReader::decode`], which writes the values
-    /// directly to their destination.
+    /// Returns false if keeping the values here saves no work: the container itself keeps the tiles, the attribute does
+    /// not vary over time, or no other frame of the block is needed or may be kept. The caller then uses
+    /// [`TileReader::decode`], which writes the values directly to their destination.
     fn try_keep(&mut self, index: usize, frame: usize) -> Result<bool> {
         let frame_block = self.frame_block(frame);
         if self.try_hold(index, frame_block)? {
@@ -218,8 +220,9 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Makes the container keep the tiles of the attribute with index `index`, in frame block `frame_block`, that this
-    /// reader needs. Returns whether all of them are in memory.
+    /// Decodes the tiles that this reader needs for one attribute and one frame block, so that the container keeps them
+    /// in memory. `index` is the index of the attribute in [`Container::places`]. Returns whether all these tiles are
+    /// now in memory; false if they do not fit into the memory that the container may use.
     fn try_hold(&self, index: usize, frame_block: u32) -> Result<bool> {
         if self.source.held.get().is_none() {
             return Ok(false);

@@ -1,4 +1,5 @@
-//! Conversion of the fixed parts of a frame stream (header and marks; format/STREAM.md) between bytes and values.
+//! Encodes and decodes the parts of a frame stream that have a fixed size: the header of the stream, and the mark
+//! before each frame and at the end (format/STREAM.md).
 
 use crate::error::quoted;
 use crate::model::{Attributes, sh_coefficients};
@@ -34,8 +35,8 @@ pub(crate) enum FrameMark {
     End(u32),
 }
 
-/// Field of a header or mark that violates the format: its offset in bytes within the header or mark, the expected
-/// value and the value found.
+/// Field of a header or mark that violates the format. `offset` is the byte within the header or mark at which the
+/// field begins; `expected`, `found` and `hint` are texts for the error message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct IllegalField {
     pub(crate) offset: u64,
@@ -44,8 +45,8 @@ pub(crate) struct IllegalField {
     pub(crate) hint: &'static str,
 }
 
-/// Hint for errors that occur if a program prints other output into the stream, or if frames have another length than
-/// stated.
+/// Advice in error messages for a stream that is not well-formed. The usual reason is that the exporter printed other
+/// text into the stream.
 const FOREIGN_OUTPUT: &str = "whatever the exporter prints must go to standard error, never into the stream";
 
 impl StreamHeader {
@@ -195,7 +196,7 @@ impl FrameMark {
     }
 }
 
-/// Hint for errors about a frame whose length differs from the one that the header states.
+/// Advice in error messages for a frame that has another length than the header requires.
 const SAME_IN_EVERY_FRAME: &str = "every frame must hold the same Gaussians in the same columns";
 
 /// Returns, as text for messages, the length in bytes that a frame must have according to the header.
@@ -204,9 +205,8 @@ fn expected_length(header: &StreamHeader) -> String {
     format!("{} bytes: {} Gaussians of {}", header.frame_bytes(), header.count, names.join(", "))
 }
 
-/// Describes `length`, the wrong length of a frame in bytes, for messages. If `length` is a multiple of the length of
-/// one Gaussian, names the number of Gaussians that have this length, else says that no number of Gaussians has it.
-/// `header` determines the length of one Gaussian.
+/// Returns `length`, the wrong length of a frame in bytes, as text for messages. The text adds how many Gaussians have
+/// this length, or that no number of Gaussians has it. `header` determines the bytes per Gaussian.
 fn found_length(header: &StreamHeader, length: u64) -> String {
     let per_gaussian = 4 * header.varying.width(header.sh_degree) as u64;
     if length.checked_rem(per_gaussian) == Some(0) {

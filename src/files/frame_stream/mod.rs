@@ -2,7 +2,8 @@
 //!
 //! Input: bytes from any source. Output: the attributes that are constant over all frames, then one frame after
 //! another. Memory: the constant attributes and the current frame. If they exceed the memory limit, they are refused
-//! before they are read. At most 1 MiB is allocated beyond twice the number of bytes received.
+//! before they are read. The memory grows only as bytes arrive: it exceeds twice the number of bytes received by at
+//! most 1 MiB, whatever the header declares.
 
 mod framing;
 #[cfg(test)]
@@ -17,7 +18,8 @@ use crate::model::{AttributeValues, Attributes, Gaussians};
 pub use framing::StreamHeader;
 pub(crate) use framing::{FrameMark, IllegalField};
 
-/// Minimum number of bytes by which the buffer for received values grows.
+/// Minimum number of bytes by which the buffer for received values grows. Otherwise it grows by the number of bytes
+/// received so far.
 const MIN_ALLOCATION_BYTES: u64 = 1 << 20;
 
 /// Frame stream of which the header and the constant attributes have been read.
@@ -160,7 +162,8 @@ impl<R: Read> CountingReader<R> {
         Ok(got)
     }
 
-    /// Reads the values of one attribute of `len` Gaussians into `column`. Returns false if the stream ends early.
+    /// Reads the values of one attribute for `len` Gaussians into `column`, which is resized if it has another length.
+    /// Returns false if the stream ends early.
     fn read_attribute(&mut self, len: usize, column: &mut AttributeValues) -> Result<bool> {
         if column.len() != len {
             let Some(planes) = self.read_new_values(len * column.width())? else { return Ok(false) };
@@ -203,8 +206,8 @@ impl<R: Read> CountingReader<R> {
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)
     }
 
-    /// Returns the error for a stream that ended before `expected` arrived. `frames` is the number of complete frames;
-    /// `None` if the header or the constant attributes are incomplete.
+    /// Returns the error for a stream that ended early. `expected` describes what should have followed. `frames` is the
+    /// number of complete frames before the end; `None` if the stream ended in its header or constant attributes.
     fn ended(&self, expected: &str, frames: Option<u32>) -> Error {
         let found = match frames {
             None => "the end of the stream, before its first frame".to_owned(),

@@ -55,7 +55,8 @@ fn refusal(bytes: &[u8]) -> String {
     error.to_string()
 }
 
-/// Reader that returns a few bytes at a time, as pipes do, and is interrupted now and then.
+/// Reader of the bytes in the first field that returns 1 to 7 bytes at a time, as pipes do. Some calls fail with
+/// `Interrupted`. The second field is the number of bytes that the last call could return.
 struct SlowReader<'a>(&'a [u8], usize);
 
 impl Read for SlowReader<'_> {

@@ -19,7 +19,8 @@ const MAX_TEXT_BYTES: usize = 1 << 20;
 const MIN_OPACITY: f64 = 1e-6;
 const MIN_SCALE: f64 = 1e-7;
 
-/// Values of one attribute of the primitive.
+/// Stored values of one attribute of the glTF primitive: `count` values, the first at the start of `bytes`, each
+/// `stride` bytes after the one before.
 struct Accessor<'a> {
     bytes: &'a [u8],
     stride: usize,
@@ -46,8 +47,8 @@ impl Accessor<'_> {
     }
 }
 
-/// Returns the number of bytes of a component type, given by its number in glTF; `None` for types that no attribute
-/// has.
+/// Returns the number of bytes of a component. `component` is glTF's number for its type, such as 5126 for f32. Returns
+/// `None` for types that no attribute of Gaussians has.
 fn component_bytes(component: u64) -> Option<usize> {
     match component {
         5120 | 5121 => Some(1),
@@ -57,8 +58,9 @@ fn component_bytes(component: u64) -> Option<usize> {
     }
 }
 
-/// Reads the Gaussians of the `.glb` file at `path`. The file must have exactly one primitive with the extension, in a
-/// node without a transform or with the rotation by 180° about z (positions in the axes of a PLY).
+/// Reads the Gaussians of the `.glb` file at `path`. The file must have exactly one primitive with the extension
+/// `KHR_gaussian_splatting`. The node of this primitive must have no transform (positions in the axes of glTF), or the
+/// rotation by 180° about z (positions in the axes of a PLY file).
 ///
 /// # Errors
 /// Fails if the file is damaged, holds no such primitive or more than one, uses another kernel or color space, holds a

@@ -12,14 +12,14 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::check_positions;
 use crate::model::{Gaussians, color_from_sh, opacity};
 
-/// Numbers by which glTF denotes the component types f32 and (`U8`) u8.
+/// Number by which glTF denotes the component type f32. `U8` is the one for u8.
 const F32: u32 = 5126;
 const U8: u32 = 5121;
 
 /// Function that appends the value of one attribute, for the Gaussian with a given index, to a list of bytes.
 type WriteValue<'a> = Box<dyn Fn(usize, &mut Vec<u8>) + 'a>;
 
-/// Attribute of the glTF primitive that is written.
+/// Attribute of the glTF primitive that is written, such as the positions of all Gaussians.
 struct Attribute<'a> {
     name: String,
     /// Type of the values in glTF's terms, such as `VEC3`.

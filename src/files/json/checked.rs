@@ -1,4 +1,5 @@
-//! Checks the bytes of a JSON file before the parser sees them.
+//! Checks the bytes of a JSON file before the parser sees them: they must be UTF-8, and strings, numbers and nesting
+//! depth must not exceed their limits.
 
 use std::io::{Error as IoError, ErrorKind, Read, Result as IoResult};
 use std::path::{Path, PathBuf};
@@ -6,7 +7,7 @@ use std::path::{Path, PathBuf};
 use crate::error::Error;
 use crate::files::text::{not_utf_8, without_mark};
 
-/// Size of the buffer in bytes: this many bytes are read and checked together.
+/// Size of the buffer in bytes. The file is read and checked in blocks of at most this size.
 const BUFFER: usize = 1 << 16;
 /// Maximum length in bytes of a string without its quotes.
 const MAX_TEXT: u32 = 1 << 20;
@@ -15,7 +16,7 @@ const MAX_NUMBER: u32 = 1 << 10;
 /// Maximum nesting depth of lists and objects in a JSON file.
 const MAX_DEPTH: u32 = 64;
 
-/// Kind of token that the byte read last belongs to.
+/// Kind of the JSON token that contains the last byte read. It determines the meaning of the next byte.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Token {
     None,
@@ -33,11 +34,12 @@ pub(super) struct CheckedReader<R> {
     file: R,
     path: PathBuf,
     buffer: Vec<u8>,
-    /// Number of bytes of the buffer that the parser has taken, and (`checked`) number of bytes that have been checked.
+    /// Number of bytes at the start of the buffer that the parser has taken. `checked` is the number of bytes at the
+    /// start of the buffer that have been checked.
     taken: usize,
     checked: usize,
-    /// Number of bytes of the buffer that have been read from the file. Up to 3 bytes of an incomplete character may
-    /// follow the checked bytes.
+    /// Number of bytes of the buffer that have been read from the file. All of them have been checked, except up to 3
+    /// bytes of an incomplete character at their end.
     filled: usize,
     /// Offset in the file of the first byte of the buffer.
     start: u64,
@@ -128,9 +130,12 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Stores `error`, which concerns the byte at index `at` of the buffer, so that the parser stops before this byte.
-    /// Returns an I/O error if the parser has already taken all bytes before it. Otherwise returns `Ok`: the parser
-    /// takes these bytes first, and a later read returns the I/O error.
+    /// Refuses the byte at index `at` of the buffer: stores `error`, which describes the reason, so that the parser
+    /// gets no byte from there on.
+    ///
+    /// - If the parser has not taken all bytes before `at`, returns `Ok`. The parser gets these bytes first, because
+    ///   they may contain an earlier error, and the next read fails.
+    /// - If it has, returns an I/O error at once.
     fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
         self.refusal = Some(error);
         // If there are bytes before the invalid one, pass them on first: they may contain an earlier error that the
@@ -142,9 +147,9 @@ impl<R: Read> CheckedReader<R> {
     }
 
     /// Checks the bytes of the buffer that were read but not checked yet. They must be UTF-8 text, and the strings,
-    /// numbers and nesting in them must not exceed their limits. Stops at the first invalid byte and passes the error
-    /// to [`CheckedReader::refuse`]. An incomplete character at the end remains unchecked until more bytes are read. If
-    /// `is_end`, no more bytes will follow, so the incomplete character is an error.
+    /// numbers and nesting in them must not exceed their limits. At the first invalid byte, stops and calls
+    /// [`CheckedReader::refuse`]. `is_end` says whether the file ends after these bytes. An incomplete character at the
+    /// end is an error if it does, else it stays unchecked until more bytes are read.
     fn check(&mut self, is_end: bool) -> IoResult<()> {
         let from = self.checked;
         let bad = match str::from_utf8(&self.buffer[from..self.filled]) {
@@ -170,8 +175,8 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Updates the kind of token, its length and the nesting depth by the next byte of the file. Returns a description
-    /// of the limit that this byte exceeds, if there is one.
+    /// Advances the state of the check by `byte`, the next byte of the file: the kind and length of the present token,
+    /// and the nesting depth. Returns `None` if no limit is exceeded, else a description of the limit for the message.
     fn step(&mut self, byte: u8) -> Option<String> {
         if self.is_blank && !byte.is_ascii_whitespace() {
             self.is_blank = false;

@@ -16,11 +16,15 @@ use crate::files::open::open_file;
 pub(crate) struct ElementPosition {
     /// Index in [`ListSelection::keys`] of the key of the list; 0 if the document itself is the list.
     pub(crate) key: usize,
-    /// Index of the element in the list. If the key of the list occurs several times, the index restarts at 0 for each
-    /// list; only the last list is valid.
+    /// Index of the element in the list. If the key of the list occurs several times in the document, the index starts
+    /// at 0 again for each of these lists. Only the last one is valid, as for any repeated key.
     pub(crate) index: usize,
-    /// Index of the element in the inner list, if the lists are nested. `None` at the end of an inner list (the value
-    /// is then an empty list), and for an element that is not a list (the value is then this element).
+    /// Index of the element in the inner list, if lists of lists are read (see [`ListSelection::nested`]). `None` in
+    /// these cases:
+    ///
+    /// - Only the outer list is read.
+    /// - The element of the outer list is not a list. The value is this element.
+    /// - An inner list has ended. The value is an empty list.
     pub(crate) inner: Option<usize>,
 }
 
@@ -29,14 +33,15 @@ pub(crate) struct ElementPosition {
 pub(crate) struct ListSelection<'a> {
     /// Keys of the top-level object whose values are the lists; empty if the document itself is the list.
     pub(crate) keys: &'a [&'a str],
-    /// Whether the elements of the lists are lists themselves, whose elements are to be read.
+    /// Whether the lists are lists of lists. If true, the elements of the inner lists are read, else the elements of
+    /// the lists themselves.
     pub(crate) nested: bool,
-    /// Keys that are always kept of each element.
+    /// Keys to keep of an element that is an object. A few other keys are also kept, for error messages.
     pub(crate) wanted: &'a [&'a str],
 }
 
-/// Calls `each` with the position and value of every element of the lists that `ask` selects in the JSON file at
-/// `path`.
+/// Reads lists in the JSON file at `path`. `ask` selects the lists. Calls `each` with the position and the value of
+/// every element.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
@@ -48,8 +53,8 @@ pub(crate) fn each_element(
     each_element_from(open_file(path)?, path, ask, each)
 }
 
-/// Calls `each` with the position and value of every element of the lists that `ask` selects in the JSON document in
-/// `file`. Error messages call the file `path`.
+/// Reads lists in the JSON document in the open `file`. `ask` selects the lists. Calls `each` with the position and the
+/// value of every element. Error messages call the file `path`.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
@@ -78,15 +83,16 @@ pub(crate) fn each_entry(
     read(path, &stopped, Entries { wanted, each: &mut each, stopped: &stopped })
 }
 
-/// Data that the visitors share: the selection of lists, the callback `each` for their elements, and `stopped`, which
-/// stores an error of the callback.
+/// State that the serde visitors of a document share while selected lists are read: the selection `ask`, the callback
+/// `each` for the elements, and `stopped`, the slot for an error of the callback.
 struct Lists<'a> {
     ask: ListSelection<'a>,
     each: &'a mut dyn FnMut(ElementPosition, SmallValue) -> Result<()>,
     stopped: &'a ParseAbort,
 }
 
-/// Defines the visitor methods for values that were not selected; the methods ignore these values.
+/// Defines the methods of a serde visitor that accepts only lists or objects: numbers, texts, booleans and null are
+/// ignored without an error.
 macro_rules! ignore_scalars {
     () => {
         fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -119,7 +125,8 @@ macro_rules! ignore_scalars {
     };
 }
 
-/// Implements [`DeserializeSeed`] for a visitor that accepts any value.
+/// Implements [`DeserializeSeed`] (serde's deserializer with state) for the visitor `$type`, which then receives a
+/// value of any JSON type.
 macro_rules! seed_from_visitor {
     ($type:ty) => {
         impl<'de> DeserializeSeed<'de> for $type {
@@ -132,7 +139,8 @@ macro_rules! seed_from_visitor {
     };
 }
 
-/// Visitor of the whole document, which holds the selected lists.
+/// Serde visitor of the top-level value of a JSON document. Finds the selected lists in it and visits each with
+/// [`List`].
 struct Document<'a, 'b>(&'a mut Lists<'b>);
 seed_from_visitor!(Document<'_, '_>);
 
@@ -158,7 +166,8 @@ impl<'de> Visitor<'de> for Document<'_, '_> {
     }
 }
 
-/// Visitor of one of the selected lists.
+/// Serde visitor of one selected list. Passes its elements to the callback `each`. `key` is the index of the list's key
+/// in [`ListSelection::keys`].
 struct List<'a, 'b> {
     lists: &'a mut Lists<'b>,
     key: usize,
@@ -188,9 +197,10 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     }
 }
 
-/// Visitor of a list element that should be a list itself. Passes each element of this inner list to the callback
-/// `each`, then returns an empty list, because the callback has received all elements. If the list element is not a
-/// list, returns this element or a description of it.
+/// Serde visitor of one element of a list of lists. If the element is a list, passes each of its elements to the
+/// callback `each` and returns an empty list, because the callback has received all of them. If it is not a list,
+/// returns the element itself, or a description of it if it is a text, an object or a number with a fraction. `at` is
+/// the position of the element in the outer list.
 struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: ElementPosition,
@@ -251,8 +261,9 @@ impl<'de> Visitor<'de> for InnerList<'_, '_> {
     }
 }
 
-/// Visitor of an object. Passes the key and the value of every entry to `each`. Of each value, only the keys `wanted`
-/// are kept.
+/// Serde visitor of a document that should be an object. Passes the key and the value of every entry to the callback
+/// `each`. Of a value that is an object, the keys `wanted` are kept. `stopped` is the slot for an error of the
+/// callback.
 struct Entries<'a> {
     wanted: &'a [&'a str],
     each: &'a mut dyn FnMut(&str, SmallValue) -> Result<()>,

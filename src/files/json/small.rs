@@ -1,4 +1,5 @@
-//! JSON values of limited size: only the parts that a camera file can need are kept in memory.
+//! JSON values of limited size. A file may hold values of any size, but only as much of a value is kept in memory as a
+//! camera file can need.
 
 use std::fmt;
 
@@ -10,15 +11,16 @@ use serde_json::{Map, Number, Value};
 const MAX_TEXT: usize = 4096;
 /// Maximum length in bytes of a key that is kept.
 const MAX_KEY: usize = 64;
-/// Maximum number of keys that are kept of an object in addition to the wanted keys.
+/// Maximum number of keys that are kept of an object, not counting the wanted keys (those that the reader asked for).
 const MAX_KEYS: usize = 8;
 /// Maximum number of elements that are kept of a list, unless the caller asks for fewer.
 pub(crate) const MAX_ELEMENTS: usize = 16;
-/// Maximum number of values, nested ones included, that are kept of one entry of the outermost object; a 4 × 4 matrix
-/// takes 21.
+/// Maximum number of values that are kept of one entry of the outermost object, including nested ones. A 4 × 4 matrix
+/// takes 21: itself, 4 rows and 16 numbers.
 const MAX_VALUES: usize = 64;
 
-/// JSON value of which only a part of limited size is kept.
+/// JSON value of limited size. Values that are too large are replaced by [`SmallValue::Large`], and a list keeps only
+/// its first elements.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum SmallValue {
     Null,
@@ -28,12 +30,13 @@ pub(crate) enum SmallValue {
     /// First elements of a list, and the number of all its elements.
     List(Vec<SmallValue>, usize),
     Object(Object),
-    /// Value that is not kept, because it has a longer text or more parts than any value in a camera file, or because
-    /// it is not of the expected kind. Holds only a description of the value, for messages.
+    /// Description, for messages, of a value that is not kept. Such a value is longer or has more parts than any value
+    /// in a camera file, or has a type that the reader does not expect.
     Large(Box<str>),
 }
 
-/// Entries of a JSON object: those with wanted keys, and a few others so that messages can describe the object.
+/// Entries of a JSON object that are kept: those with wanted keys (keys that the reader asked for), and a few others
+/// for messages. `others` is the number of the latter.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Object {
     entries: Vec<(Box<str>, SmallValue)>,
@@ -116,7 +119,7 @@ impl SmallValue {
         }
     }
 
-    /// Converts the kept part of the value to a JSON value.
+    /// Converts the value to a `serde_json` value. Lists hold only the elements that were kept.
     fn value(&self) -> Value {
         match self {
             SmallValue::Null => Value::Null,
@@ -133,7 +136,8 @@ impl SmallValue {
     }
 }
 
-/// Seed (builder) that reads any JSON value as [`SmallValue`].
+/// Deserializer (serde seed) that reads any JSON value and returns as much of it as the limits allow, as
+/// [`SmallValue`].
 #[derive(Debug)]
 pub(crate) struct Keep<'a> {
     /// Keys that are always kept of an object.
@@ -150,10 +154,12 @@ impl<'de> DeserializeSeed<'de> for Keep<'_> {
     }
 }
 
-/// Seed (builder) and visitor of a JSON value at any nesting depth.
+/// Deserializer (serde seed and visitor) of a JSON value inside the value that [`Keep`] reads. `depth` is its nesting
+/// depth, 0 for the outermost value.
 struct NestedValue<'a> {
     keep: &'a Keep<'a>,
-    /// Number of values, nested ones included, that may still be kept of the current entry of the outermost object.
+    /// Number of values, including nested ones, that may still be kept of the present entry of the outermost object.
+    /// Starts at 64 ([`MAX_VALUES`]) for every entry.
     remaining: &'a mut usize,
     depth: usize,
 }
@@ -254,7 +260,8 @@ impl<'de> Visitor<'de> for NestedValue<'_> {
     }
 }
 
-/// Seed (builder) that reads an object key and keeps only its first bytes.
+/// Deserializer (serde seed) of the key of an object. Returns the key. If the key is longer than 64 bytes
+/// ([`MAX_KEY`]), returns its beginning followed by "…".
 #[derive(Debug)]
 pub(crate) struct ShortKey;
 

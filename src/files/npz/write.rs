@@ -30,10 +30,13 @@ pub(crate) enum GaussianAxis {
     Axis1,
 }
 
-/// Writes a copy of the archive `template` to `path` that keeps only the Gaussians `kept`. `axis` receives an array and
-/// returns the axis of the array whose index is the Gaussian. `change` receives the name of an array, a frame and the
-/// values of the kept Gaussians at this frame. It may change these values, and returns the indices of the Gaussians
-/// that it changed. The values of all other Gaussians keep their bytes.
+/// Writes a copy of the archive `template` to `path` that has only the Gaussians with the indices `kept`. Two functions
+/// decide about the arrays:
+///
+/// - `axis` receives an array and returns which of its axes counts the Gaussians.
+/// - `change` receives the name of an array, a frame number and the values of the kept Gaussians at this frame. It may
+///   change these values, and returns the indices (in `kept`) of the Gaussians that it changed. All other values keep
+///   their bytes.
 ///
 /// # Errors
 /// Fails if an array cannot be decoded, if `change` fails, or if the file cannot be written.

@@ -57,8 +57,9 @@ pub(super) struct PickleMachine<'a> {
     instructions: u32,
     allocations: AllocationCounter,
     nodes: Vec<Node>,
-    /// Nesting depth of each node when it was last changed; 0 for a scalar. If a container grows later, the depths of
-    /// the nodes that contain it are not updated, so code that follows the nodes must count the depth itself.
+    /// For each node, its nesting depth: 0 for a scalar, 1 for a container of scalars, and so on. A value is not
+    /// updated when a container inside the node grows later. So code that follows the nodes must count the depth
+    /// itself.
     depths: Vec<u8>,
     frames: Vec<Range<usize>>,
     stack: Vec<NodeId>,
@@ -197,8 +198,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Executes the instruction `instruction`, found at byte `start`, if it pushes a number, a text or other bytes
-    /// without structure. Fails for other instructions.
+    /// Executes the instruction `instruction`, which was read at byte `start`, if it pushes a value that contains no
+    /// other values: a number, a text, bytes, a boolean or `None`. Fails for all other instructions.
     fn step_scalar(&mut self, instruction: u8, start: usize) -> Result<(), Wrong> {
         match instruction {
             b'N' => self.push(Node::None, 0)?,
@@ -233,7 +234,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds `node` to the object tree and pushes it onto the stack. `depth` is its nesting depth, 0 for a scalar.
+    /// Adds `node` to the object tree and pushes its index onto the stack. `depth` is the nesting depth of the node, 0
+    /// for a scalar.
     fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
         self.allocations.reserve(&mut self.nodes, 1, self.at)?;
         self.allocations.reserve(&mut self.depths, 1, self.at)?;
@@ -244,7 +246,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds `node` to the object tree and inserts it into the stack at index `place`.
+    /// Adds `node`, an empty container, to the object tree and inserts its index into the stack at index `place`, below
+    /// the values that will be added to the container.
     fn push_below(&mut self, node: Node, place: usize) -> Result<(), Wrong> {
         self.push(node, 1)?;
         self.stack[place..].rotate_right(1);
@@ -256,7 +259,8 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Int(value, start as u32..self.at as u32), 0)
     }
 
-    /// Returns the nesting depth of a container that holds `nodes`. Fails if it is too deep.
+    /// Returns the nesting depth of a new container whose elements are `nodes`: one more than the largest depth among
+    /// them. Fails if it would exceed [`MAX_DEPTH`].
     fn container_depth(&self, nodes: impl IntoIterator<Item = NodeId>) -> Result<u8, Wrong> {
         let deepest = nodes.into_iter().map(|id| self.depths[id as usize]).max().unwrap_or(0);
         match deepest < MAX_DEPTH {
@@ -270,8 +274,9 @@ impl<'a> PickleMachine<'a> {
         Wrong::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
     }
 
-    /// Begins a container by recording the present height of the stack. `start` is the byte at which the instruction
-    /// began. Fails if too many containers are open.
+    /// Executes the instruction MARK, which began at byte `start`: it opens a container whose elements are pushed next.
+    /// Records the present height of the stack as the index of the first element. Fails if too many containers are
+    /// open.
     fn mark(&mut self, start: usize) -> Result<(), Wrong> {
         if self.marks.len() >= usize::from(MAX_DEPTH) {
             return Err(self.too_deep());
@@ -281,18 +286,20 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Returns the stack index at which the innermost open container begins; 0 if no container is open.
+    /// Returns the lowest stack index that instructions may use at present: the index of the first element of the
+    /// innermost open container; 0 if no container is open.
     fn floor(&self) -> usize {
         self.marks.last().copied().unwrap_or(0)
     }
 
-    /// Returns the error for an instruction that needs more values than are on the stack.
+    /// Returns the error for an instruction that needs more values than there are on the stack since the last MARK
+    /// (instruction that opens a container).
     fn missing(&self) -> Wrong {
         Wrong::at(self.at, "a value that was never given")
     }
 
-    /// Removes the top value of the stack and returns it. Fails if the innermost open container has no value on the
-    /// stack.
+    /// Removes the top value of the stack and returns its node. Fails if no value was pushed since the innermost open
+    /// container was begun.
     fn pop(&mut self) -> Result<NodeId, Wrong> {
         match self.stack.len() > self.floor() {
             true => Ok(self.stack.pop().expect("there is one")),
@@ -300,20 +307,20 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the stack index at which the top `count` values begin. Fails if the innermost open container has no
-    /// further value on the stack below these values.
+    /// Returns the stack index of the lowest of the top `count` values. These are values to be added to a container, so
+    /// there must be one more value, the container, below them. Fails if there is none in the innermost open container.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }
 
-    /// Ends the innermost open container. Returns the stack index of its first element.
+    /// Closes the innermost open container (the last MARK instruction). Returns the stack index of its first element.
     fn unmark(&mut self) -> Result<usize, Wrong> {
         let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of a container that was never begun"))?;
         Ok(mark.min(self.stack.len()))
     }
 
-    /// Replaces the values from stack index `first` up to the top by one container with these elements. `make` builds
-    /// the node of the container from the elements.
+    /// Removes the values from stack index `first` up to the top, and pushes one container with these values as
+    /// elements. `make` builds the node of the container from the nodes of the elements.
     fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), Wrong> {
         let depth = self.container_depth(self.stack[first..].iter().copied())?;
         let mut elements = Vec::new();
@@ -326,9 +333,10 @@ impl<'a> PickleMachine<'a> {
         self.push(make(elements), depth)
     }
 
-    /// Returns the node index of the value directly below stack index `first`: the container to which the values from
-    /// `first` up to the top will be added. Raises the nesting depth of this container above their depths. Fails if the
-    /// innermost open container has no value there, or if the container would be nested too deep.
+    /// Returns the node index of the container to which an instruction adds values. The values are those from stack
+    /// index `first` up to the top, and the container is directly below them on the stack. Sets the nesting depth of
+    /// the container to at least one more than the depths of the values. Fails if there is nothing below the values in
+    /// the innermost open container, or if the nesting would be too deep.
     fn container(&mut self, first: usize) -> Result<usize, Wrong> {
         let below = first.checked_sub(1).filter(|&below| below >= self.floor());
         let top = self.stack[below.ok_or_else(|| self.missing())?] as usize;
@@ -337,9 +345,10 @@ impl<'a> PickleMachine<'a> {
         Ok(top)
     }
 
-    /// Removes the values from stack index `first` up to the top and appends them to the list directly below them on
-    /// the stack. If the value below is an object that behaves like a list, the removed values are discarded. Fails if
-    /// it is neither; the error names byte `start` of the pickle.
+    /// Appends the values from stack index `first` up to the top to the list directly below them on the stack, and
+    /// removes them from the stack. If there is the result of a call below them (an object with a method `append`), the
+    /// values are discarded, because they are not needed. Fails for anything else; the error names byte `start` of the
+    /// pickle.
     fn extend(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         match &mut self.nodes[top] {
@@ -354,9 +363,10 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Removes the keys and values from stack index `first` up to the top and adds them to the dict directly below them
-    /// on the stack, or to the object there that behaves like a dict. Fails if the value below is neither, or if a key
-    /// has no value; the error names byte `start` of the pickle.
+    /// Adds keys and values to the dict, or the result of a call (such as an `OrderedDict`), that lies directly below
+    /// them on the stack. Keys and values alternate from stack index `first` up to the top; they are removed from the
+    /// stack. Fails if anything else lies below them, or if a key has no value; the error names byte `start` of the
+    /// pickle.
     fn set(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         let (pairs, rest) = self.stack[first..].as_chunks::<2>();
@@ -408,9 +418,9 @@ impl<'a> PickleMachine<'a> {
         Ok(&self.bytes[self.at - count..self.at])
     }
 
-    /// Reads an integer of variable length and pushes it onto the stack. Its length in bytes is stored before it, in
-    /// `length_bytes` bytes; its instruction began at byte `start`. Integers that do not fit into `i64` become opaque
-    /// nodes.
+    /// Reads an integer of any length and pushes it onto the stack. `start` is the byte at which its instruction began.
+    /// The pickle holds the number of bytes of the integer first, which takes `length_bytes` bytes, then the integer.
+    /// An integer that does not fit into `i64` becomes [`Node::Opaque`].
     fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         let digits = self.take_slice(length)?;
@@ -435,7 +445,8 @@ impl<'a> PickleMachine<'a> {
         Ok(u64::from_le_bytes(wide))
     }
 
-    /// Reads a text and pushes it. Its length in bytes is stored before it, in `length_bytes` bytes.
+    /// Reads a UTF-8 text and pushes it onto the stack. The pickle holds the length of the text in bytes first, which
+    /// takes `length_bytes` bytes, then the text.
     fn text(&mut self, length_bytes: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         let start = self.at;
@@ -446,7 +457,8 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Text(text.into()), 0)
     }
 
-    /// Skips bytes whose length is stored before them, in `length_bytes` bytes, and pushes an opaque node for them.
+    /// Skips a byte string and pushes [`Node::Opaque`] for it. The pickle holds the length of the byte string first,
+    /// which takes `length_bytes` bytes, then the bytes.
     fn blob(&mut self, length_bytes: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         self.take_slice(length)?;

@@ -1,4 +1,4 @@
-//! Converts the bodies of text PLY files to the equivalent binary bodies, so that one reader serves both.
+//! Converts the rows of text PLY files to the binary form of PLY, so that the same code reads text and binary files.
 //!
 //! Input: a header and the text after it. Output: little-endian rows of every element, appended to a scratch file.
 //! Memory: one line of text.
@@ -12,11 +12,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::header::{Element, PlyHeader, Property, Scalar};
 use crate::error::{Error, Result, quoted};
 
-/// Maximum length in bytes of a line of a text PLY file. [`LINE_BYTES_PER_NUMBER`] bytes are allowed in addition for
-/// each number of the row.
+/// Maximum length in bytes of a line of a text PLY file, apart from its numbers. For each number in the row,
+/// [`LINE_BYTES_PER_NUMBER`] bytes more are allowed.
 const LINE_BYTES: u64 = 1 << 20;
-/// Maximum number of bytes that a number in a text PLY file may take: the longest usual form of an f64 has 24
-/// characters.
+/// Number of bytes by which each number of a row extends the maximum length of a line of a text PLY file. The longest
+/// usual form of an f64 has 24 characters.
 const LINE_BYTES_PER_NUMBER: u64 = 64;
 
 /// Unnamed scratch file that holds the rows of any number of text PLY files in binary form. Created when the first text
@@ -41,9 +41,9 @@ impl TextStore {
         TextStore { folder: folder.to_owned(), file: Mutex::new(None) }
     }
 
-    /// Converts the body of the text PLY file `text`, opened from `path`, to binary rows in the scratch file, and
-    /// returns where they are. `header` is the header of the file. There is one row per line. Blank lines are skipped;
-    /// text after the last row is ignored.
+    /// Converts the text PLY file `text`, opened from `path`, to binary rows in the scratch file. `header` is its
+    /// parsed header. Returns the byte range of the rows in the scratch file. Every line of the text holds one row.
+    /// Blank lines are skipped; text after the last row is ignored.
     ///
     /// # Errors
     /// Fails, naming the line, if there are too few rows, if a row has too few or too many numbers, if a word is not a
@@ -80,8 +80,8 @@ impl TextStore {
     }
 }
 
-/// Checks that `available` bytes of text can hold the rows that the header declares: a number takes at least a digit
-/// and a separator.
+/// Checks that a text file can hold as many rows as its header declares. `available` is the number of bytes after the
+/// header, and a number takes at least two of them: a digit and a separator.
 fn check_counts(path: &Path, header: &PlyHeader, available: u64) -> Result<()> {
     for element in &header.elements {
         let least = element.count.checked_mul(2 * element.properties.len() as u64);

@@ -1,4 +1,5 @@
-//! Notes on the defects of a PLY file: rows with unusual values, and parts of the file that are not read.
+//! Notes for the user about a PLY file: how many rows have unusual values (such as NaN or a zero quaternion), and which
+//! elements and SH coefficients are not read.
 
 use super::write::value;
 use super::{PlaneSource, Ply, PlyEncoding};
@@ -6,11 +7,12 @@ use crate::error::Result;
 use crate::files::defects::{Defects, INFINITE_LOGIT_REPAIR, LISTED_ROWS, first_of};
 use crate::model::{Attributes, Gaussians, INFINITE_LOGIT};
 
-/// Number of rows that are checked together.
+/// Number of rows (Gaussians) that are read and checked at a time.
 const CHECKED_ROWS: usize = 4096;
 
 impl Ply {
-    /// Returns notes for the user on the parts of the file that are not read. Reads no rows.
+    /// Returns notes for the user about content of the file that is not read: elements with list properties, and SH
+    /// coefficients of degree 4. Uses only the header.
     pub(crate) fn header_notes(&self) -> Vec<String> {
         let skipped = (!self.header.skipped.is_empty()).then(|| {
             format!(
@@ -36,8 +38,8 @@ impl Ply {
         })
     }
 
-    /// Reads all rows once. Returns notes for the user: those of [`Ply::header_notes`], and the numbers of rows with a
-    /// zero quaternion, an infinite opacity logit, or other values that are not finite.
+    /// Reads all rows (Gaussians) once. Returns notes for the user: how many rows have a zero quaternion, an infinite
+    /// opacity logit, or other values that are not finite; then the notes of [`Ply::header_notes`].
     ///
     /// # Errors
     /// Fails if the file was truncated since it was opened.
@@ -52,8 +54,8 @@ impl Ply {
         Ok(found.notes())
     }
 
-    /// Returns the notes of [`Ply::notes`] without reading the rows again. `whole` holds all attributes of all rows, as
-    /// read from this file.
+    /// Returns the same notes for the user as [`Ply::notes`], without reading the file. `whole` holds all attributes of
+    /// all rows (Gaussians) of this file.
     pub(crate) fn notes_with(&self, whole: &Gaussians) -> Vec<String> {
         let mut found = RowDefects::new(self);
         found.add(0, whole);
@@ -61,12 +63,12 @@ impl Ply {
     }
 }
 
-/// Rows of a PLY file with unusual values.
+/// Counts of the rows (Gaussians) of a PLY file that have unusual values, such as NaN or a zero quaternion.
 struct RowDefects<'a> {
     ply: &'a Ply,
-    /// Rows with values that the reader replaces.
+    /// Counts of the rows with values that the reader replaces: zero quaternions and infinite opacity logits.
     repaired: Defects,
-    /// First rows with NaN or infinity, and the number of all such rows.
+    /// Rows with NaN or infinity: the indices of the first five such rows, and the number of all such rows.
     non_finite: (Vec<u32>, usize),
 }
 
@@ -75,7 +77,8 @@ impl RowDefects<'_> {
         RowDefects { ply, repaired: Defects::new(ply.count), non_finite: (Vec::new(), 0) }
     }
 
-    /// Counts the defects of the rows from `start` on, whose values are in `block`.
+    /// Counts the defects of some rows. `block` holds all attributes of these rows, and `start` is the index in the
+    /// file of the first one.
     fn add(&mut self, start: usize, block: &Gaussians) {
         for row in 0..block.len() {
             let mut found = Vec::new();
@@ -100,7 +103,7 @@ impl RowDefects<'_> {
         }
     }
 
-    /// Returns the notes for the user, those on the header last.
+    /// Returns the notes for the user: about the counted rows first, then about content that is not read.
     fn notes(&self) -> Vec<String> {
         let (first, count) = &self.non_finite;
         let not_drawn = (*count > 0).then(|| {

@@ -111,7 +111,7 @@ pub(crate) struct Element {
     pub(crate) name: String,
     pub(crate) count: u64,
     pub(crate) properties: Vec<Property>,
-    /// Length of a binary row in bytes, without list properties.
+    /// Length of a binary row in bytes. Has a meaning only if the element has no list properties.
     pub(crate) stride: usize,
     /// Whether the element has list properties, so that its rows have no fixed size.
     has_lists: bool,
@@ -228,9 +228,12 @@ impl PlyHeader {
         Err(missing_end(path, length))
     }
 
-    /// Returns the bytes of this header changed to `count` Gaussians. `name` receives the name of a property and
-    /// returns its new name, or `None` to remove it. Skipped elements are left out. Everything else stays the same,
-    /// except that a text format becomes little-endian binary.
+    /// Returns the bytes of a copy of this header for a file with `count` Gaussians, which differs from this header as
+    /// follows:
+    ///
+    /// - `name` receives the name of each property of the Gaussians and returns its new name, or `None` to remove it.
+    /// - Elements that are not read ([`PlyHeader::skipped`]) are left out.
+    /// - The encoding `ascii` (text) becomes little-endian binary.
     pub(crate) fn text_for(&self, count: usize, name: impl Fn(&str) -> Option<String>) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.text.len() + 16);
         let (mut in_vertex, mut is_skipped) = (false, false);
@@ -280,9 +283,9 @@ fn missing_end(path: &Path, length: usize) -> Error {
     Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again")
 }
 
-/// Checks that the rows of the last of `elements`, which has the list property `name`, may be skipped. This is the case
-/// if there are no such rows, or if they come after the rows of Gaussians. The error names the file `path` and the
-/// place that `place` returns.
+/// Checks that this program can read the Gaussians of a file in which the last element of `elements` has a list
+/// property called `name`. Rows with lists have no fixed size. So the element must not be `vertex`, and it must have no
+/// rows or come after `vertex`. The error names the file `path` and the position that `place` returns.
 fn check_list(path: &Path, place: impl Fn() -> String, elements: &[Element], name: &str) -> Result<()> {
     let is_skippable = |element: &Element, before: &[Element]| {
         element.name != "vertex" && (element.count == 0 || before.iter().any(|element| element.name == "vertex"))
@@ -303,8 +306,9 @@ fn check_list(path: &Path, place: impl Fn() -> String, elements: &[Element], nam
     }
 }
 
-/// Splits `elements` into the elements whose rows can be found, and the names of all other elements. Rows of elements
-/// with a list property cannot be found, nor can rows of elements after a list element that has rows.
+/// Divides `elements` into elements that can be read, and the names of elements that cannot be read because the offsets
+/// of their rows are unknown. The latter are all elements with a list property, and all elements after one that has a
+/// list property and at least one row.
 fn without_lists(elements: Vec<Element>) -> (Vec<Element>, Vec<String>) {
     let first = elements.iter().position(|element| element.has_lists && element.count > 0).unwrap_or(elements.len());
     let (mut found, mut skipped) = (Vec::new(), Vec::new());
@@ -319,8 +323,8 @@ fn word(line: &[u8], at: usize) -> &[u8] {
     excerpt(line).split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).nth(at).unwrap_or_default()
 }
 
-/// Returns the first bytes of a line, enough for any keyword with its arguments. A line of binary data may be very
-/// long.
+/// Returns at most the first 1024 bytes of a line. This is enough for any keyword of a header with its arguments,
+/// whereas a "line" of binary data may be very long.
 fn excerpt(line: &[u8]) -> &[u8] {
     &line[..line.len().min(1024)]
 }

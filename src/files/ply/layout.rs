@@ -9,10 +9,10 @@ use super::header::{Element, Property};
 use crate::error::{Error, Result};
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 
-/// Natural logarithm of the thickness that is given to a surfel, as a fraction of its smaller axis: 1/1000. (A surfel
-/// is a flat Gaussian of 2DGS, without `scale_2`.) The thickness is relative, so that results do not depend on the unit
-/// of the scene. It is thin enough to vanish under the rasterizer's dilation of 0.3 px², and thick enough to give a
-/// valid f32 covariance.
+/// Natural logarithm of 1/1000: the thickness that a surfel gets, as a fraction of its smaller axis. (A surfel is a
+/// flat Gaussian of 2DGS. Its file has no `scale_2`.) The thickness is relative, so that results do not depend on the
+/// unit of length of the scene. It is thin enough to vanish under the rasterizer's dilation of 0.3 px², and thick
+/// enough to give a valid f32 covariance.
 pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
 
 /// Largest SH degree that a file may have.
@@ -27,8 +27,8 @@ pub(crate) enum PlaneSource {
     Thin,
 }
 
-/// Layout of a row: for each plane (component) of every attribute, the source of its values. The attributes are in the
-/// order of [`Gaussians`](crate::model::Gaussians).
+/// Layout of a row (Gaussian) in a PLY file: for each plane (one component of an attribute, such as the x of the
+/// position), the source of its values.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlyLayout {
     /// SH degree that is read, 0 to 3.

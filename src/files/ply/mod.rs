@@ -59,8 +59,8 @@ impl Default for PlyOptions {
     }
 }
 
-/// Parses the header at the start of `bytes`, the content of the file at `path`, and returns the number of Gaussians
-/// that it declares. Does not check the rows after the header.
+/// Parses the header of a PLY file and returns the number of Gaussians that it declares. `bytes` are the first bytes of
+/// the file, and `path` names it in errors. The rows after the header are not checked.
 ///
 /// # Errors
 /// Fails like [`Ply::open_with`], as far as the errors depend only on the header.
@@ -80,22 +80,23 @@ pub struct Ply {
     stride: usize,
     properties: Vec<Property>,
     body: PlyBody,
-    /// Byte range of the rows of the element `vertex` in the body.
+    /// Byte range of the rows of the element `vertex` (the Gaussians) in the bytes after the header.
     rows: Range<usize>,
-    /// End of the bytes that writers copy, as an offset in the body.
+    /// Offset, in the bytes after the header, at which the content ends that writers copy to output files.
     end: usize,
     count: usize,
     memory: ReadLimit,
 }
 
-/// Body of a PLY file: the tables of all elements, after the header.
+/// Rows of all elements of an open PLY file: the bytes after the header in memory-mapped binary form.
 #[derive(Debug)]
 struct PlyBody {
     /// Memory map of the whole file; for a text file, of its converted rows in the scratch file.
     map: FileMap,
     /// Offset in bytes, in `map`, of the first table.
     start: usize,
-    /// For a text file, its length in bytes and its converted rows; `None` for a binary file.
+    /// For a text file: the length of the file in bytes, and the location of its rows, which were converted to binary.
+    /// `None` for a binary file.
     text: Option<(u64, TextRows)>,
 }
 
@@ -142,7 +143,8 @@ impl Ply {
         Self::with_text_rows(path, memory, |_| text.cloned().ok_or_else(|| encoding_changed(path)))
     }
 
-    /// Opens the PLY file at `path`. If it is a text file, `convert` returns its converted rows.
+    /// Opens the PLY file at `path`. If it is a text file, calls `convert`, which receives the header and returns the
+    /// location of the rows in binary form.
     fn with_text_rows(
         path: &Path,
         memory: ReadLimit,
@@ -284,8 +286,8 @@ impl Ply {
         Ok(Some(values))
     }
 
-    /// Returns the number of bytes of the file that must be read for `rows` Gaussians. For a text file, this is the
-    /// whole file.
+    /// Returns the number of bytes of the file that must be read to get `rows` Gaussians, for statistics. For a text
+    /// file this is always the length of the file.
     pub(crate) fn bytes_read_for(&self, rows: usize) -> u64 {
         match &self.body.text {
             None => (rows * self.stride) as u64,
@@ -309,7 +311,8 @@ impl Ply {
         &self.body.bytes()[self.rows.clone()][i * self.stride..(i + 1) * self.stride]
     }
 
-    /// Returns the number of bytes of the binary body before the rows of `vertex`, and the number of bytes after them.
+    /// Returns two numbers of bytes in the binary form of the file that writers copy: the bytes between the header and
+    /// the rows of `vertex`, and the bytes after these rows.
     pub(crate) fn bytes_around(&self) -> [usize; 2] {
         [self.rows.start, self.end - self.rows.end]
     }
@@ -334,8 +337,8 @@ impl Ply {
         self.body.map.check()
     }
 
-    /// Records that the rows at the byte offsets `starts` are about to be read, so that their pages can be released
-    /// later.
+    /// Records that some rows (Gaussians) are about to be read, so that their memory-mapped pages can be released
+    /// later. `starts` holds the byte offset of each row from the first row.
     fn touch(&self, starts: &[usize]) {
         let first = self.body.start + self.rows.start;
         for run in starts.chunk_by(|a, b| a + self.stride == *b) {
@@ -370,8 +373,9 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     }
 }
 
-/// Returns the byte range of the rows of the element `vertex` in the binary body of a PLY file, and the offset at which
-/// the last element that is not skipped ends. Fails if the body has fewer bytes (`available`) than its header declares.
+/// Finds the rows of the Gaussians in the binary form of a PLY file. `available` is the number of bytes after the
+/// header. Returns the byte range of the rows of the element `vertex`, and the offset at which the last element that
+/// can be read ends; both count from the end of the header. Fails if the file has fewer bytes than its header declares.
 fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<(Range<usize>, usize)> {
     let mut end = 0u64;
     let mut rows = 0..0;
@@ -394,8 +398,9 @@ fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<(Ran
     Ok((rows, end as usize))
 }
 
-/// Reads the values of `property` into `out`, from the rows that begin at the byte offsets `starts` in `rows`.
-/// `big_endian` states the byte order of the rows.
+/// Reads the values of `property` for some Gaussians into `out`, converted to f32. `rows` holds the bytes of the rows,
+/// and `starts` the offset in `rows` of the row of each of these Gaussians. `big_endian` says whether the numbers are
+/// big-endian.
 pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big_endian: bool, out: &mut [f32]) {
     let at = property.offset;
     match (property.scalar, big_endian) {
@@ -416,8 +421,8 @@ pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big
     }
 }
 
-/// Converts, for each row, the `W` bytes at `offset` in the row to f32 by `convert`, and writes the results to `out`.
-/// `starts` holds the byte offset of each row in `rows`.
+/// Reads one number from each of some rows into `out`: `convert` converts the `W` bytes at `offset` in a row to f32.
+/// `rows` holds the bytes of the rows, and `starts` the offset in `rows` of each row to be read.
 fn fill<const W: usize>(
     rows: &[u8],
     starts: &[usize],

@@ -15,18 +15,19 @@ use crate::files::ply::{
 };
 use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
-/// One row (Gaussian) of the PLY file of a compressed model.
+/// Row (Gaussian) to be written to the PLY file of a compressed model, and where its values come from.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutputRow {
-    /// Index of the Gaussian in the original file (template) whose row is copied: the Gaussian itself, or the leader
-    /// (most important Gaussian) of its merged cluster.
+    /// Index of the row of the original file (template) that is copied: the row of the Gaussian itself. For a proxy
+    /// (Gaussian that replaces a merged cluster) it is the row of the leader, the most important Gaussian of the
+    /// cluster.
     pub source: u32,
     /// Index of the proxy (Gaussian that replaces a merged cluster) whose attributes replace those of the row; `None`
     /// for a Gaussian that was not merged.
     pub proxy: Option<u32>,
 }
 
-/// Returns the rows of the PLY file to be written for the compressed model `reduction`.
+/// Returns the rows to be written to the PLY file of the compressed model `reduction`, in output order.
 pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutputRow> {
     let mut rows: Vec<OutputRow> = reduction.kept.iter().map(|&source| OutputRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
@@ -50,8 +51,8 @@ pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutputRow> {
 /// the largest first.
 ///
 /// Other elements of the template and the bytes after the last element are copied. If the template is a text file, the
-/// output is little-endian binary. Otherwise, writing all rows in order without proxies and changes reproduces the
-/// template byte for byte.
+/// output is little-endian binary. If it is a binary file, writing all of its rows in order without proxies and changes
+/// reproduces it byte for byte.
 ///
 /// # Errors
 /// Fails if a source or proxy does not exist, if the proxies have another SH degree, if `change` has another number of
@@ -76,9 +77,11 @@ pub fn write_like_template(
     })
 }
 
-/// Writes a PLY file with the rows (Gaussians) `sources` of the open file `template`. `edit` receives the index of each
-/// output row and its bytes, and may change the bytes. `name` receives the name of a property and returns its new name,
-/// or `None` to remove it. Other elements and the bytes after the last element are copied.
+/// Writes a PLY file with copies of rows (Gaussians) of the open file `template`: the rows with the indices `sources`,
+/// in this order. Other elements and the bytes after the last element are copied.
+///
+/// - `edit` receives the index of each output row and its bytes, and may change the bytes.
+/// - `name` receives the name of a property and returns its new name, or `None` to remove the property.
 ///
 /// # Errors
 /// Fails if a source does not exist, if the template was truncated since it was opened, or if the file cannot be
@@ -126,8 +129,8 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     write_inria_with(gaussians, comments, &[], path)
 }
 
-/// Writes `gaussians` and `comments` like [`write_inria`], with the float properties `more` appended to each row. Each
-/// of these properties is given by its name and one value per Gaussian.
+/// Writes a PLY file like [`write_inria`], with additional float properties `more` after the usual ones. Each element
+/// of `more` is the name of a property and its values, one per Gaussian.
 ///
 /// # Errors
 /// Fails like [`write_inria`].
@@ -183,23 +186,27 @@ fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl I
     header + "end_header\n"
 }
 
-/// Returns the stored bytes of the extra properties (those that are no attribute of a Gaussian) in the `rows` of
-/// `template`, one row after another.
+/// Returns the stored bytes of the extra properties of some rows (Gaussians) of `template`, one row after another.
+/// `rows` are the indices of the rows. Extra properties are those that hold no attribute of a Gaussian, such as
+/// normals.
 pub(crate) fn extra_property_bytes(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8> {
     let ranges = extra_ranges(template.properties(), template.layout());
     rows.flat_map(|row| ranges.iter().flat_map(move |range| template.row(row as usize)[range.clone()].to_vec()))
         .collect()
 }
 
-/// Returns the number of bytes per row of the extra properties of `template` (those that are no attribute of a
-/// Gaussian).
+/// Returns how many bytes of each row (Gaussian) of `template` belong to extra properties. These are the properties
+/// that hold no attribute of a Gaussian, such as normals.
 pub(crate) fn extra_bytes_per_row(template: &Ply) -> usize {
     extra_ranges(template.properties(), template.layout()).iter().map(ExactSizeIterator::len).sum()
 }
 
-/// Writes a PLY file to `path` with the header `header`, which was read from the file `from`. The rows hold the
-/// attributes of `cloud` and the extra properties in the bytes `extra_bytes`. `lead` and `tail` are the bytes before
-/// and after the rows.
+/// Writes a PLY file to `path` that is put together from its parts:
+///
+/// - `header` is the header, which was read from the file `from` (for error messages).
+/// - `cloud` holds the attributes of the Gaussians.
+/// - `extra_bytes` holds the bytes of the extra properties (those that hold no attribute, such as normals), row by row.
+/// - `lead` and `tail` are the bytes before and after the rows of the Gaussians.
 ///
 /// # Errors
 /// Fails if the header does not match the rows, or if the file cannot be written.
@@ -261,8 +268,8 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
     fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-/// Checks that all proxies named in `rows` exist, that `proxies` have the SH degree of `template`, and that `change`
-/// has one value per row for each attribute that it changes.
+/// Checks that all proxies (Gaussians that replace merged clusters) named in `rows` exist, that `proxies` have the SH
+/// degree of `template`, and that `change` has one value per row for each attribute that it changes.
 fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
     for column in change.attributes().iter() {
         let changes = change.0.column(column).len();
@@ -302,8 +309,8 @@ fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gauss
     }
 }
 
-/// Adds the parameter delta `change` (change of the stored values) of output row number `place` to `row`, the bytes of
-/// this row, which is laid out as in `template`.
+/// Adds a parameter delta to the bytes `row` of one output row, which has the layout of `template`. `change` holds the
+/// deltas (changes of the stored values) of all output rows, and `place` is the index of this row.
 fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     for column in change.attributes().iter() {

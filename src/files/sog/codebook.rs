@@ -1,25 +1,28 @@
-//! Codebook of 256 sorted numbers: a byte stands for a number (scalar quantization).
+//! Scalar quantization for `.sog` files: a codebook is a list of 256 numbers, and a value is stored as the byte that is
+//! the index of the nearest number.
 
 /// Number of entries of a codebook.
 pub const ENTRIES: usize = 256;
 /// Number of equal bins into which the range of the values is divided to find the entries.
 const BINS: usize = 1 << 14;
 
-/// Codebook of at most 256 numbers; a byte stands for the number with this index. [`Codebook::fit`] chooses 256 numbers
-/// in increasing order.
+/// Codebook: list of at most 256 numbers (entries). A stored byte is an index in this list.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Codebook {
     entries: Vec<f32>,
 }
 
 impl Codebook {
-    /// Chooses entries for `values`. If there are at most 256 different values, they are the entries. Otherwise half of
-    /// the entries are spread evenly over the range. The other half are denser where values are denser: their density
-    /// is proportional to the cube root of the density of the values, which is best for the mean squared error (P. F.
-    /// Panter and W. Dite, "Quantization Distortion in Pulse-Count Modulation with Nonuniform Spacing of Levels",
-    /// 1951). No value is further from its entry than 1/200 of the range.
+    /// Chooses the entries of a codebook for `values`.
     ///
-    /// Values that are not finite are ignored; without finite values, all entries are 0.
+    /// - If there are at most 256 different values, they are the entries.
+    /// - If there are more, half of the entries are spread evenly over the range of the values. The other half are
+    ///   denser where values are denser: their density is proportional to the cube root of the density of the values,
+    ///   which is best for the mean squared error (P. F. Panter and W. Dite, "Quantization Distortion in Pulse-Count
+    ///   Modulation with Nonuniform Spacing of Levels", 1951).
+    ///
+    /// The distance of any value from the nearest entry is at most 1/200 of the range. Values that are not finite are
+    /// ignored; without finite values, all entries are 0.
     pub fn fit<I: Iterator<Item = f32>>(values: impl Fn() -> I) -> Codebook {
         let finite = || values().filter(|value| value.is_finite()).map(|value| value + 0.0);
         if let Some(entries) = few_different(finite()) {
@@ -55,7 +58,7 @@ impl Codebook {
         Codebook { entries }
     }
 
-    /// Returns the entries, 256 in increasing order if the codebook was chosen by [`Codebook::fit`].
+    /// Returns the entries. If [`Codebook::fit`] chose them, there are 256 in increasing order.
     pub fn entries(&self) -> &[f32] {
         &self.entries
     }
@@ -84,8 +87,8 @@ struct Bin {
     max: f32,
 }
 
-/// Returns the different values among `values` in increasing order, padded to 256 entries; `None` if there are more
-/// than 256.
+/// Returns the different numbers among `values` in increasing order, with the last one repeated so that there are 256.
+/// Returns `None` if there are more than 256 different numbers.
 fn few_different(values: impl Iterator<Item = f32>) -> Option<Vec<f32>> {
     let mut different: Vec<f32> = Vec::new();
     for value in values {

@@ -1,5 +1,5 @@
-//! Attributes of Gaussians as images of bytes: pixel i, row by row from the top, belongs to Gaussian number i of the
-//! file.
+//! Converts attributes of Gaussians to images of bytes and back. Pixel i of an image, row by row from the top, belongs
+//! to Gaussian number i of the file.
 
 use rayon::prelude::*;
 
@@ -9,9 +9,11 @@ use crate::archive::interleave_zeros;
 use crate::files::webp::{MAX_SIDE, RgbaImage};
 use crate::model::{AttributeValues, logit};
 
-/// Largest value of a 16-bit number that is stored as a low and a high byte.
+/// Largest number of 16 bits. A `.sog` file stores such a number in two images: its low byte in one, its high byte in
+/// the other.
 const MAX_16_BIT: f64 = 65_535.0;
-/// Alpha that marks a rotation whose component w is left out. The next three numbers mark x, y and z.
+/// Alpha of a pixel that stores a quaternion without its component w. 253, 254 and 255 stand for quaternions without x,
+/// y and z.
 const FIRST_ROTATION_TAG: u8 = 252;
 /// Number of palette entries in one row of the image of the palette.
 const ENTRIES_PER_ROW: usize = 64;
@@ -34,8 +36,9 @@ impl ImageSize {
         (width < MAX_SIDE && height < MAX_SIDE).then_some(ImageSize { width, height })
     }
 
-    /// Creates an image of this size. Pixel i belongs to the Gaussian with index `order[i]`, and `pixel` returns the
-    /// bytes for the Gaussian with a given index; the remaining pixels are (0, 0, 0, 255).
+    /// Creates an image of this size in which pixel i belongs to the Gaussian with index `order[i]`. `pixel` receives
+    /// the index of a Gaussian and returns the four bytes (red, green, blue, alpha) of its pixel. The pixels that
+    /// belong to no Gaussian are (0, 0, 0, 255).
     pub fn image(self, order: &[u32], pixel: impl Fn(usize) -> [u8; 4]) -> RgbaImage {
         let mut image = RgbaImage::new(self.width, self.height);
         image.pixels.iter_mut().zip(order).for_each(|(to, &row)| *to = pixel(row as usize));
@@ -90,8 +93,9 @@ pub fn from_log_coordinate(n: f64) -> f64 {
     n.abs().exp_m1().copysign(n)
 }
 
-/// Returns the indices of the Gaussians at `position` in Morton order of their logarithmic coordinates, 16 bits per
-/// axis: Gaussians near one another in space are near in the images, which then compress better.
+/// Returns the indices of the Gaussians at `position`, sorted by the Morton code of their logarithmic coordinates with
+/// 16 bits per axis. In this order, Gaussians that are near one another in space are also near in the images, which
+/// then compress better.
 pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
     let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
     let range = Range3::from_rows((0..position.len()).map(logs));
@@ -171,9 +175,9 @@ pub fn decode_rotation(pixel: [u8; 4]) -> Option<[f32; 4]> {
     Some(q.map(|x| (x / length) as f32))
 }
 
-/// Returns the image of size `size` for the three-component `values`. Each component is stored as its index in
-/// `codebook`, and `alpha` returns the alpha for the Gaussian with a given index. Pixel i holds the Gaussian
-/// `order[i]`.
+/// Returns an image of size `size` in which pixel i belongs to the Gaussian with index `order[i]`. Red, green and blue
+/// are the indices in `codebook` of the entries nearest to the three components of the Gaussian in `values`. `alpha`
+/// receives the index of a Gaussian and returns the alpha of its pixel.
 pub fn encode_by_codebook(
     values: &AttributeValues,
     codebook: &Codebook,
@@ -198,8 +202,8 @@ pub fn encode_opacity(opacity: f64) -> u8 {
     (255.0 * opacity).round() as u8
 }
 
-/// Returns the finite opacity logit that the byte `code` stands for. The bytes 0 and 255 stand for opacities a quarter
-/// of a step from 0 and 1.
+/// Returns the opacity logit that the byte `code` stands for. It is finite: the bytes 0 and 255 are decoded as the
+/// opacities 0.25/255 and 254.75/255 instead of 0 and 1.
 pub fn decode_opacity(code: u8) -> f32 {
     logit(f64::from(code).clamp(0.25, 254.75) / 255.0) as f32
 }

@@ -1,9 +1,10 @@
-//! Palette of SH coefficients: each Gaussian refers to the nearest of a limited number of vectors (vector quantization
-//! by k-means).
+//! Vector quantization by k-means: chooses a palette of at most k vectors of SH coefficients for N Gaussians. Each
+//! Gaussian then refers to the nearest palette entry.
 //!
-//! The vectors are first divided into √k groups by k-means, then each group gets its share of the k palette entries,
-//! also by k-means. This takes about N·√k comparisons of vectors per iteration instead of N·k. Starting points are
-//! evenly spaced in the order of the Gaussians, so the same Gaussians give the same palette for any number of threads.
+//! K-means first divides the vectors of all Gaussians into √k groups. Each group gets a number of palette entries in
+//! proportion to its size, and k-means chooses these entries. This takes about N·√k comparisons of vectors per
+//! iteration instead of N·k. Starting points are evenly spaced in the order of the Gaussians, so the same Gaussians
+//! give the same palette for any number of threads.
 
 use rayon::prelude::*;
 
@@ -11,7 +12,7 @@ use rayon::prelude::*;
 pub const MAX_ENTRIES: usize = 1 << 16;
 /// Number of iterations of k-means.
 const ITERATIONS: usize = 6;
-/// Number of sampled vectors per group. The centroids of the groups are computed from this sample.
+/// Number of vectors, per group of vectors, in the sample from which k-means computes the centers of the groups.
 const SAMPLES_PER_GROUP: usize = 64;
 
 /// Palette of vectors (SH coefficients), and for each Gaussian the index of its palette entry.
@@ -26,9 +27,11 @@ pub struct Palette {
 }
 
 impl Palette {
-    /// Chooses a palette of at most `max_entries` entries for `count` Gaussians. `vector` receives the index of a
-    /// Gaussian and appends the vector of this Gaussian, of `width` components, to a list. If there can be as many
-    /// entries as Gaussians, each Gaussian gets its own entry. Otherwise Gaussians with equal vectors share an entry.
+    /// Chooses a palette of at most `max_entries` vectors with `width` components for `count` Gaussians. `vector`
+    /// receives the index of a Gaussian and appends the vector of this Gaussian to a list.
+    ///
+    /// - If `max_entries` is at least the number of Gaussians, each Gaussian gets its own entry.
+    /// - If it is less, similar vectors share an entry, and equal vectors always do.
     pub fn fit(
         count: usize,
         width: usize,
@@ -96,9 +99,9 @@ fn evenly_spaced(count: usize, wanted: usize) -> impl Iterator<Item = usize> {
     (0..wanted).map(move |i| (i as u128 * count as u128 / wanted as u128) as usize)
 }
 
-/// Divides `entries` palette entries among groups of vectors and returns the number of entries of each group. `sizes`
-/// holds the number of vectors in each group. A group with vectors gets at least one entry and at most one per vector;
-/// the sum is at most `entries`.
+/// Returns the number of palette entries that each group of vectors gets, when `entries` palette entries are divided in
+/// proportion to the sizes of the groups. `sizes` holds the number of vectors in each group. A group that is not empty
+/// gets at least one entry and at most one per vector; the sum is at most `entries`.
 fn shares(sizes: &[usize], entries: usize) -> Vec<usize> {
     let total: usize = sizes.iter().sum();
     let filled = sizes.iter().filter(|&&size| size > 0).count();

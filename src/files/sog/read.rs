@@ -23,14 +23,16 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// Maximum length in bytes of `meta.json`; three codebooks take about 20 kB.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Maximum number of files in an archive, and (`MAX_LIST_BYTES`) maximum length in bytes of the list of these files.
+/// Maximum number of files in an archive. `MAX_LIST_BYTES` is the maximum length in bytes of the list of these files.
 const MAX_ENTRIES: u64 = 1024;
 const MAX_LIST_BYTES: u64 = 4 << 20;
 /// Bytes of memory per pixel while an image is decoded: the image and the buffers of the decoder.
 const BYTES_PER_PIXEL: u64 = 16;
-/// Maximum number of images with one pixel per Gaussian that are in memory together while a file is read.
+/// Maximum number of large images (those with one pixel per Gaussian) that are in memory at the same time while a file
+/// is read.
 const IMAGES: u64 = 6;
-/// Maximum number of pixels of the image of palette entries: 65536 entries of degree 3.
+/// Maximum number of pixels of the image that holds the palette of SH coefficients: 65536 entries with 15 pixels each,
+/// one per coefficient of degrees 1 to 3.
 const MAX_PALETTE_PIXELS: usize = 15 << 16;
 /// Largest magnitude of a logarithmic coordinate that is accepted, so that the coordinate is finite as f32.
 const MAX_LOG_COORDINATE: f64 = 88.0;
@@ -132,8 +134,8 @@ impl Files {
         Ok(Files::Archive(ZipArchive::new(file).map_err(|error| damaged(error.to_string()))?))
     }
 
-    /// Decodes the image called `name`. Fails if it has more than `max_pixels` pixels, if its file is larger than
-    /// `memory`, or if it is damaged. Messages call the archive `path`.
+    /// Reads and decodes the image file called `name`. Error messages call the archive `path`. Fails if the image is
+    /// missing or damaged, has more than `max_pixels` pixels, or its file is larger than `memory`.
     fn image(&mut self, path: &Path, name: &str, max_pixels: usize, memory: ReadLimit) -> Result<RgbaImage> {
         // A lossless WebP takes little more than four bytes per pixel, so more cannot come from a valid file.
         let most = ReadLimit::new(memory.bytes().min(8 * max_pixels as u64 + (1 << 20)));
@@ -143,10 +145,11 @@ impl Files {
             .map_err(|found| Error::input(path, name, format!("a lossless WebP of at most {max_pixels} pixels"), found))
     }
 
-    /// Decodes the image called `name`, which has a pixel for each of `count` Gaussians.
+    /// Reads and decodes the image file called `name`, in which the first `count` pixels belong to the Gaussians. Error
+    /// messages call the archive `path`; `memory` limits the size of the file.
     ///
     /// # Errors
-    /// Fails if the image is missing, damaged, too small, or much larger than needed.
+    /// Fails if the image is missing or damaged, or has less than `count` or more than 4 × `count` + 65536 pixels.
     pub(crate) fn image_of_gaussians(
         &mut self,
         path: &Path,
@@ -200,8 +203,8 @@ fn parse(text: &[u8], path: &Path) -> Result<Meta> {
     })
 }
 
-/// Returns the ranges of the logarithmic coordinates of the positions from `meta`. Fails if a range is not within ±88
-/// ([`MAX_LOG_COORDINATE`]).
+/// Returns the ranges of the logarithmic coordinates that positions have according to `meta`. Fails if a range exceeds
+/// ±88 ([`MAX_LOG_COORDINATE`]).
 fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
     let (mins, maxs) = (meta.means.mins, meta.means.maxs);
     for axis in 0..3 {
@@ -219,8 +222,9 @@ fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
     Ok(Range3 { mins, maxs })
 }
 
-/// Returns the codebook with the numbers `entries`, which must be 1 to 256 finite numbers. `what` names it in messages.
-/// Some writers store null as the first number, which then counts as equal to the second one.
+/// Builds a codebook (table of the numbers that bytes stand for) from `entries`, 1 to 256 finite numbers in
+/// `meta.json`. `what` is the name of its member for error messages. The first entry may be `None`, because some
+/// writers store null there. It then gets the value of the second entry.
 fn codebook(entries: &[Option<f32>], path: &Path, what: &str) -> Result<Codebook> {
     let place = || format!("meta.json, {what}, codebook");
     if entries.is_empty() || entries.len() > super::codebook::ENTRIES {

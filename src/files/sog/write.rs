@@ -23,9 +23,11 @@ use crate::files::webp::RgbaImage;
 use crate::files::zip_output::ZipOutput;
 use crate::model::{Gaussians, color_from_sh, opacity};
 
-/// Largest magnitude of ln s that is stored: beyond, a Gaussian is smaller than any pixel or larger than any scene.
+/// Largest magnitude of ln s that is stored, where s is a scale in scene units. Gaussians with ln s below −20 are
+/// smaller than any pixel, those with ln s above 20 larger than any scene.
 const MAX_LOG_SCALE: f32 = 20.0;
-/// Maximum number of palette entries of a file with fewer than 2048 Gaussians.
+/// Minimum of the limit on palette entries (see [`palette_entries`]): the limit for files with fewer than 2048
+/// Gaussians.
 const LEAST_PALETTE: usize = 1024;
 
 /// Errors of a written file: differences between the Gaussians and the values in the file.
@@ -90,7 +92,8 @@ pub(crate) fn write_archive(path: &Path, images: NamedImages, meta: &impl Serial
     archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
-/// Returns the Gaussians of `state` whose opacity is not stored as 0, in the same order.
+/// Returns the Gaussians of `state` without those that a `.sog` file would store with the opacity byte 0, in the same
+/// order.
 pub fn visible_only(state: &Gaussians) -> Cow<'_, Gaussians> {
     let is_drawn = |row: u32| encode_opacity(opacity(state.opacity_logit.plane(0)[row as usize])) > 0;
     let rows: Vec<u32> = (0..state.len() as u32).filter(|&row| is_drawn(row)).collect();
@@ -100,8 +103,9 @@ pub fn visible_only(state: &Gaussians) -> Cow<'_, Gaussians> {
 /// Images of a file with their names in the archive.
 pub(crate) type NamedImages = Vec<(String, RgbaImage)>;
 
-/// Encodes the Gaussians `state`, in the order `order`, as images of size `size`. Returns the content of `meta.json`,
-/// the images with their names, and the errors. `kind` names the file in messages, for example "a .sog".
+/// Encodes the Gaussians `state` as images of size `size`, in which pixel i belongs to the Gaussian `order[i]`. Returns
+/// the content of `meta.json`, the images with their file names, and the errors of the stored values. `kind` names the
+/// file in messages, for example "a .sog".
 ///
 /// # Errors
 /// Fails if stored values would exceed the error bounds of [`accuracy`](crate::files::accuracy).
@@ -162,9 +166,10 @@ pub(crate) fn encode(
     Ok((meta, images, SogErrors { position: accuracy.position_error(), sh }))
 }
 
-/// Adds the images of the SH coefficients of `state` above degree 0 to `images`. The image of the palette labels has
-/// the size `size`, and its pixel i holds the Gaussian `order[i]`. Returns the member `shN` of `meta.json`, and the
-/// root of the mean squared error of these coefficients; `None` if there are no such coefficients.
+/// Encodes the SH coefficients of `state` above degree 0 as two images and adds them to `images`: the palette, and the
+/// palette label of each Gaussian. The image of the labels has the size `size`, and its pixel i belongs to the Gaussian
+/// `order[i]`. Returns the member `shN` of `meta.json`, and the root of the mean squared error of the coefficients;
+/// `None` if there are no such coefficients.
 fn encode_sh(
     state: &Gaussians,
     size: ImageSize,
@@ -204,8 +209,8 @@ fn encode_sh(
     Some((entry, (sum / (state.len() * width) as f64).sqrt()))
 }
 
-/// Returns the maximum number of palette entries for a file of `count` Gaussians: a power of two between 1024 and
-/// 65536, at most the number of Gaussians if that is above 1024.
+/// Returns the maximum number of palette entries for a file of `count` Gaussians: the largest power of two that is at
+/// most `count`, but at least 1024 and at most 65536.
 fn palette_entries(count: usize) -> usize {
     let doublings = (count / LEAST_PALETTE).max(1).ilog2().min(6);
     LEAST_PALETTE << doublings

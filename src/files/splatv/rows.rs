@@ -1,9 +1,9 @@
-//! Rows (Gaussians) of a `.splatv` file that players treat specially: padding, rows that no player draws, and unlimited
-//! temporal windows.
+//! Checks and repairs rows (Gaussians) of a `.splatv` file with values that players do not draw or treat in a special
+//! way.
 //!
-//! splaTV and gsplat.js draw no row with a NaN position, none with a width of 0, and none whose quaternion is 0 at
-//! every time, because they divide by the length of the quaternion. They show a row with an infinite width at every
-//! time, because exp(−(dt/∞)²) = 1.
+//! The players splaTV and gsplat.js draw no row with a NaN position and none with a temporal width of 0. They draw no
+//! row whose quaternion is 0 at every time, because they divide by the length of the quaternion. They show a row with
+//! an infinite width at every time, because exp(−(dt/∞)²) = 1.
 
 use half::f16;
 use serde::{Deserialize, Serialize};
@@ -23,7 +23,7 @@ pub enum ZeroRotation {
     Identity,
 }
 
-/// Kind of defect: its name, whether rows with this defect are left out, and the reason.
+/// Kind of defect of a row (Gaussian). The elements are its name, whether rows with it are left out, and the reason.
 type Defect = (&'static str, bool, &'static str);
 
 const NON_FINITE_POSITION: Defect = ("NaN or infinite position", true, "no player draws them");
@@ -36,8 +36,8 @@ const KEPT_ZERO_QUATERNION: Defect = ("zero quaternion", false, "taken as the id
 const INFINITE_WIDTH: Defect =
     ("infinite temporal width", false, "visible at every time, as in players; written as the largest half");
 
-/// Returns the defects of a row (Gaussian). `zero_rotation` decides whether a quaternion that is 0 at every time drops
-/// the row.
+/// Returns the defects of one row (Gaussian). `zero_rotation` determines whether a row whose quaternion is 0 at every
+/// time is left out or repaired.
 fn defects(row: &SplatvGaussian, zero_rotation: ZeroRotation) -> Vec<Defect> {
     let is_finite = |values: &[f32]| values.iter().all(|x| x.is_finite());
     let others = [&row.motion[..], &row.rotation, &row.omega, &row.scale, &[row.center]];
@@ -61,9 +61,9 @@ pub(crate) fn has_zero_quaternion(row: &SplatvGaussian) -> bool {
     row.rotation == [0.0; 4] && row.omega == [0.0; 4]
 }
 
-/// Checks every row (Gaussian) of `file`. Returns the defects found and, if some rows have to be left out, the indices
-/// of the other rows in increasing order. `zero_rotation` decides whether rows whose quaternion is 0 at every time are
-/// left out.
+/// Checks every row (Gaussian) of `file`. Returns the counts of defects, and the indices of the rows to keep,
+/// increasing; `None` instead of indices if all rows are kept. `zero_rotation` determines whether rows whose quaternion
+/// is 0 at every time are left out.
 ///
 /// # Errors
 /// Fails if all rows of the file would be left out.
@@ -93,7 +93,7 @@ pub fn check_rows(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects
     Ok((found, rows))
 }
 
-/// Repairs the words that store a row (Gaussian) that is kept: an infinite width becomes the largest finite
+/// Repairs `words`, which store one row (Gaussian), in place. An infinite temporal width becomes the largest finite
 /// half-precision value, and a quaternion that is 0 at every time becomes the identity.
 pub fn repair_words(words: &mut [u32; WORDS_PER_GAUSSIAN]) {
     let row = SplatvGaussian::from_words(words);

@@ -17,8 +17,8 @@ use crate::files::splatv::{MAGIC, ROW_BYTES, SplatvGaussian, TEXELS_PER_ROW, WOR
 use crate::model::RobustBox;
 use crate::model::{AttributeValues, Camera};
 
-/// Index of the camera of the virtual rig that is used as the default view; it is neither at the top nor at the bottom
-/// of the scene.
+/// Index of the camera that is the default view, among the 12 cameras that [`virtual_rig`] places around a scene. It is
+/// neither at the top nor at the bottom of the scene.
 const DEFAULT_CAMERA: usize = 4;
 /// Distance in time from the center of the temporal window, as a multiple of its width, at which an opacity of 1 has
 /// fallen to 1/255.
@@ -26,12 +26,12 @@ const VISIBLE_WIDTHS: f64 = 2.36;
 /// Number of texels of the texture that store one Gaussian.
 const TEXELS_PER_GAUSSIAN: usize = 4;
 
-/// Returns the 32-bit words that store the Gaussian `row` in a file for viewers.
+/// Returns the 32-bit words that store the Gaussian `row` in a `.splatv` file.
 ///
 /// - Values beyond the range of half precision become the largest finite value; NaN becomes 0.
-/// - Players divide by the length of the quaternion, so the quaternion and its rate of change must not both be stored
-///   as 0. If half precision would turn both into 0, both are first divided by the length of the quaternion. If this
-///   length is 0, NaN or too small to divide by, the identity is stored as the quaternion instead.
+/// - The quaternion and its rate of change must not both be stored as 0, because players divide by the length of the
+///   quaternion. If both are so small that half precision turns them into 0, both are first divided by the length of
+///   the quaternion. If this length cannot be divided by (0, NaN or subnormal), the quaternion becomes the identity.
 pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
@@ -73,8 +73,8 @@ pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
 }
 
 /// Adds the coding errors of Gaussian `id` to `to`: the differences between `row` and the values that a file stores for
-/// it. The position error includes the error of the path at the times at which the Gaussian is visible, around the
-/// center of its temporal window.
+/// it. The position error is an upper bound of the error along the Gaussian's path while it is visible, so it includes
+/// the rounding of the polynomial coefficients.
 pub fn add_errors(row: &SplatvGaussian, id: usize, to: &mut CodingErrors) {
     let held = SplatvGaussian::from_words(&encode_words(row));
     let drawn = |row: &SplatvGaussian| RenderedAttributes {
@@ -92,8 +92,8 @@ pub fn add_errors(row: &SplatvGaussian, id: usize, to: &mut CodingErrors) {
     to.add(id, &wanted, &found);
 }
 
-/// Returns the JSON of a camera as it is listed in the file. The rows of `rotation` are those of the camera-to-world
-/// matrix.
+/// Returns a camera as a JSON object, as the list of cameras of a `.splatv` file holds it. `rotation` in it is the
+/// camera-to-world matrix, as a list of rows.
 pub fn camera_json(camera: &Camera) -> Value {
     let to_world = camera.rotation.transpose();
     let position = -(to_world * camera.translation);
@@ -104,7 +104,8 @@ pub fn camera_json(camera: &Camera) -> Value {
     })
 }
 
-/// Returns the list of cameras for a model without cameras: one camera that sees most of the Gaussians at `positions`.
+/// Returns the JSON list of cameras for a `.splatv` file of a model without cameras. It holds one camera, which looks
+/// at the middle of the Gaussians at `positions`.
 pub fn default_cameras(positions: &AttributeValues) -> Value {
     let found = RobustBox::from_positions(positions);
     virtual_rig(found.median, found.extent())

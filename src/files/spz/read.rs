@@ -20,9 +20,11 @@ const HEADER_BYTES: usize = 16;
 const MAX_DEGREE: u8 = 4;
 /// Bit of the flags in the header that says that the file has extensions (optional data, which this reader skips).
 const HAS_EXTENSIONS: u8 = 2;
-/// Maximum number of bytes between the header and the table of streams of version 4.
+/// Maximum number of bytes of extensions (optional data) in a file of version 4. They lie between the header and the
+/// table of array sizes.
 const MAX_EXTENSION_BYTES: u64 = 1 << 20;
-/// Base-2 logarithm of the largest zstd window, in bytes, that is accepted when an array is decoded.
+/// Largest zstd window that is accepted when an array is decoded, as the base-2 logarithm of its size in bytes. The
+/// window determines the memory that the decoder takes.
 const MAX_WINDOW: u32 = 24;
 
 /// Values that the header of a file declares.
@@ -47,8 +49,8 @@ struct Arrays {
 }
 
 impl Arrays {
-    /// Returns the arrays in the order of the file. Each array comes with its name and its number of bytes per
-    /// Gaussian, which `header` determines.
+    /// Returns the six arrays in the order of the file. Each element is the name of the array, its number of bytes per
+    /// Gaussian for a file with the header `header`, and its content.
     fn list(&mut self, header: &Header) -> [(&'static str, usize, &mut Vec<u8>); 6] {
         let rotation = if header.version == 2 { 3 } else { 4 };
         let harmonics = 3 * (sh_coefficients(header.sh_degree) - 1);
@@ -144,8 +146,8 @@ fn read_gzip(mut source: impl Read, path: &Path, memory: ReadLimit) -> Result<(H
     Ok((header, arrays))
 }
 
-/// Reads the header and the arrays of a file of version 4, which is `length` bytes long. `source` returns all bytes of
-/// the file, and `head` holds the first of them.
+/// Reads the header and the arrays of a file of version 4. `source` returns all bytes of the file, and `length` is
+/// their number. `head` holds the first bytes of the file once more, at most 32.
 fn read_streams(
     mut source: impl Read,
     head: &[u8],

@@ -13,8 +13,9 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 pub(crate) use write::{StoredTensor, TensorValues, write_state_dict};
 
-/// Maximum ratio of the bytes of all tensors to the size of the file. A tensor may repeat stored values (stride 0), so
-/// a small file can declare any number of values. No trained state dict is smaller than a quarter of its tensors.
+/// Maximum ratio of the bytes of all tensors in a file to the size of the file. The limit is needed because a tensor
+/// may repeat stored values (stride 0), so a small file can declare a huge tensor. No trained state dict has a larger
+/// ratio.
 pub(crate) const MAX_EXPANSION: u64 = 4;
 /// Maximum length of the name of a tensor in bytes.
 const MAX_NAME_BYTES: usize = 1024;
@@ -34,8 +35,9 @@ pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors>
     read_state_dict_with_note(path, memory).map(|(tensors, _)| tensors)
 }
 
-/// Reads tensors like [`read_state_dict`]. If all names of tensors in the file begin with the prefix of a wrapper of
-/// the model, which is left out, also returns a note about it for the user.
+/// Reads tensors like [`read_state_dict`]. The names of all tensors may begin with a prefix that a wrapper of the model
+/// (such as `torch.compile`) added. It is removed, and a note for the user says so. Returns the tensors and this note,
+/// if there is one.
 ///
 /// # Errors
 /// Fails like [`read_state_dict`].
@@ -73,7 +75,7 @@ pub(crate) fn read_state_dict_with_note(path: &Path, memory: ReadLimit) -> Resul
     Ok((tensors, note))
 }
 
-/// Returns the note for the user that all names of tensors begin with `prefix`, which is left out.
+/// Returns the note for the user that says that `prefix` was removed from the names of all tensors.
 pub(crate) fn wrapper_note(prefix: &str) -> String {
     format!("the names of all tensors begin with {}, of a wrapper of the model; read without it", quoted(prefix))
 }
@@ -108,9 +110,10 @@ pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
 /// by dots.
 struct StateDict {
     checkpoint: Checkpoint,
-    /// Tensors by their names without `prefix`.
+    /// Tensors by their names, from which `prefix` has been removed.
     tensors: BTreeMap<String, TensorView>,
-    /// Prefix of all names in the file, which a wrapper of the model added; empty if there is none.
+    /// Prefix of the names of all tensors in the file, which a wrapper of the model (such as `torch.compile`) added;
+    /// empty if there is none.
     prefix: String,
 }
 
@@ -155,15 +158,15 @@ struct TensorSearch<'a> {
     checkpoint: &'a Checkpoint,
     /// Number of nodes of the object tree that may still be visited.
     left: usize,
-    /// Bytes of memory of the tensors found so far, without their values.
+    /// Bytes of memory that the names and descriptions of the tensors found so far take, without their values.
     name_bytes: u64,
     found: BTreeMap<String, TensorView>,
 }
 
 impl TensorSearch<'_> {
-    /// Adds the tensors at and below node `id` of the object tree. `name` is the name of this node and `depth` its
-    /// depth in the tree. Fails if the tree is too deep or too large, or if a value seems to be a tensor of an unknown
-    /// kind.
+    /// Searches for tensors in the object tree of a pickle, from node `id` downward, and adds them to `found`. `name`
+    /// is the name of the node: the keys that lead to it, joined by dots. `depth` is the number of these keys. Fails if
+    /// the tree is too deep or too large, or if a value seems to be a tensor of an unknown kind.
     fn visit(&mut self, id: NodeId, name: &mut String, depth: u8) -> Result<()> {
         let (checkpoint, pickle) = (self.checkpoint, self.checkpoint.pickle());
         self.left =
@@ -206,8 +209,8 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
-    /// Adds the tensors at and below node `id`. This node is the child with the key `part` of the node that is called
-    /// `name` and has the depth `depth` in the object tree.
+    /// Searches for tensors from node `id` downward, like [`TensorSearch::visit`]. The node is a child, with the key
+    /// `part`, of another node: `name` is the name of that parent node and `depth` its depth in the object tree.
     fn visit_part(&mut self, id: NodeId, name: &mut String, part: &str, depth: u8) -> Result<()> {
         let before = name.len();
         if before > 0 {

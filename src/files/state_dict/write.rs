@@ -25,8 +25,8 @@ const ALIGNMENT: u16 = 64;
 pub(crate) struct StoredTensor {
     /// Name of the tensor; the keys of nested dicts are joined by dots.
     pub(crate) name: String,
-    /// Storage of which the tensor is a view. Each element of the tensor is one of these values, at an index that
-    /// follows from `offset` and `stride`.
+    /// Stored values, of which the tensor is a view: `offset` and `stride` say which of them is which element of the
+    /// tensor.
     pub(crate) values: TensorValues,
     /// Index in `values` of the first element.
     pub(crate) offset: usize,
@@ -120,8 +120,8 @@ fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &
     archive.write_all(bytes)
 }
 
-/// Returns the pickle (protocol 2) of an ordered dictionary of the tensors by name. It refers to the values of each
-/// tensor by a number.
+/// Returns the pickle (protocol 2) of an ordered dictionary that maps names to tensors. The pickle refers to the values
+/// of a tensor by a number: the index of the tensor, which is also the name of the file with its values.
 fn pickle(tensors: &[StoredTensor]) -> Vec<u8> {
     const DICTIONARY: &[u8] = b"ccollections\nOrderedDict\n)R";
     let mut out = [b"\x80\x02", DICTIONARY, b"("].concat();

@@ -20,9 +20,9 @@ use crate::model::{AttributeValues, StoredParams};
 const MAX_META_BYTES: u64 = 4 << 20;
 /// Bytes of memory per Gaussian for its time window and velocity, and for the images of both.
 const TIMELINE_BYTES: u64 = 4 * 5 + 4 * 16;
-/// Members of `meta.json` that may be absent, but not null.
+/// Members of `meta.json` that may be absent. A member that is present must not be null.
 const OPTIONAL: [&str; 6] = ["shN", "timeline", "temporal", "fps", "playback", "profile"];
-/// Largest accepted frame rate, in frames per second, and largest accepted duration, in seconds.
+/// Largest accepted frame rate in frames per second. Also the largest accepted duration in seconds.
 const MAX_PLAYBACK: f64 = 1e6;
 
 /// Returns whether the file at `path` is a ZIP archive with a `meta.json` of version 4.
@@ -109,8 +109,9 @@ fn frame_count(entry: &TimelineEntry, path: &Path) -> Result<usize> {
     Ok(frames)
 }
 
-/// Reads the images of the timeline `entry` from `files`. Writes the frame or the time window of each Gaussian to
-/// `own`, the format-specific parameters of the Gaussians.
+/// Reads when each Gaussian is visible: decodes the two images of the timeline `entry` from `files`. Writes the result
+/// to `own`, the format-specific parameters: the index of the one frame in which the Gaussian is seen, or the center
+/// and deviation of its time window. `timeline` says which of the two the file has.
 fn read_timeline(
     entry: &TimelineEntry,
     timeline: Timeline,
@@ -144,8 +145,9 @@ fn read_timeline(
     Ok(())
 }
 
-/// Reads the images of the velocities that `entry` describes from `files`. Writes the velocity of each Gaussian to
-/// `own`, the format-specific parameters of the Gaussians.
+/// Reads the velocity of each Gaussian: decodes the one or two images that `entry` describes from `files`. Writes the
+/// velocities to `own`, the format-specific parameters of the Gaussians. `path` names the file in errors, and `memory`
+/// limits the size of the images.
 fn read_velocities(
     entry: &Velocity,
     files: &mut Files,
@@ -174,8 +176,8 @@ fn read_velocities(
     Ok(())
 }
 
-/// Returns `range` if its ends are finite numbers in order, else fails. `member` is the member of `meta.json` that is
-/// named in the message.
+/// Checks the value ranges `range` and returns them: the ends of each range must be finite as f32 and in increasing
+/// order. Error messages name the file `path` and the member `member` of `meta.json`.
 fn checked(range: Range3, path: &Path, member: &str) -> Result<Range3> {
     let wrong = (0..3).find(|&c| {
         let (min, max) = (range.mins[c], range.maxs[c]);
@@ -195,9 +197,9 @@ fn is_f32(value: f64) -> bool {
     (value as f32).is_finite()
 }
 
-/// Returns the number, the rate and the times of the frames of the archive described by `meta`, whose Gaussians have
-/// the visibility `timeline`. The times are those of the sequence that was converted if the file states them, else from
-/// 0 to 1.
+/// Returns the number of frames, the frame rate and the mapping of times of an archive with the content `meta` of its
+/// `meta.json`. `timeline` says when the Gaussians are visible. Players use times from 0 to 1. If `meta` states the
+/// times of the original sequence, they are mapped to these; otherwise the mapping leaves times unchanged.
 fn clip_times(meta: &TsogMeta, timeline: Timeline, path: &Path) -> Result<ClipTimes> {
     let playback = meta.playback.as_ref();
     let number = |name: &str, value: Option<f64>| match value {

@@ -14,15 +14,16 @@ use crate::files::sog::write::{NamedImages, SogErrors, encode, write_archive};
 use crate::model::{StoredParams, logit, opacity};
 
 /// Largest standard deviation of a time window that is stored, as a multiple of the length of the sequence. Wider
-/// windows become windows of this width; the opacity changes by at most 1/500 of its value then. A larger limit would
-/// leave fewer of the 65536 steps for narrow windows.
+/// windows are replaced by windows of this width, which changes the opacity by at most 1/500 of its value. With a
+/// larger limit, the 65536 steps of the stored deviation would be too coarse for narrow windows.
 const MAX_DEVIATION: f64 = 8.0;
 /// Largest opacity, so that its logit is finite.
 const MAX_OPACITY: f64 = 1.0 - 1e-6;
 /// Maximum number of frames of a timeline of type 0, in which each Gaussian is seen in a single frame.
 pub const MAX_FRAMES: usize = 1 << 16;
-/// Maximum position errors up to which velocities are stored with 8 bits: first the root of the mean squared error over
-/// all Gaussians, then the largest error. The unit is the middle one of a Gaussian's three scales.
+/// Largest position errors with which velocities are stored with 8 bits; with larger errors they are stored with 16
+/// bits. The first number is the root of the mean squared error over all Gaussians, the second the largest error. The
+/// unit is the middle one of a Gaussian's three scales.
 const MAX_8_BIT_ERRORS: [f64; 2] = [0.03, 0.25];
 
 /// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`. Returns the
@@ -73,8 +74,8 @@ pub fn write_tsog(content: &TimedGaussians, path: &Path) -> Result<SogErrors> {
 }
 
 /// Returns the Gaussians `params` with time windows whose standard deviation is at most [`MAX_DEVIATION`]. A wider
-/// window is replaced by a narrower one. In the middle of the sequence, the opacity and the slope of the logarithm of
-/// the opacity stay the same. The motion does not change.
+/// window becomes a window with this deviation. Its center and the opacity are chosen so that the opacity in the middle
+/// of the sequence, and the slope of its logarithm there, stay the same. The path of the Gaussian does not change.
 fn narrowed(params: &StoredParams) -> StoredParams {
     let mut params = params.clone();
     for row in 0..params.len() {
@@ -136,9 +137,10 @@ fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images:
     TimelineEntry { kind: 1, frames: None, delta: None, mins, maxs, files }
 }
 
-/// Adds the velocities of `params` to `images`: one image with 8 bits per axis if these are accurate enough, else two
-/// images with 16 bits per axis. The images have the size `size`, and pixel i holds the Gaussian `order[i]`. Returns
-/// the member `temporal` of `meta.json`; `None` if nothing moves.
+/// Encodes the velocities of `params` and adds them to `images`: one image with 8 bits per axis if
+/// [`are_8_bits_enough`], else two images with the low and the high bytes of 16 bits per axis. The images have the size
+/// `size`, and pixel i belongs to the Gaussian `order[i]`. Returns the member `temporal` of `meta.json`; `None` if no
+/// Gaussian moves.
 fn encode_velocities(
     params: &StoredParams,
     size: ImageSize,
@@ -175,9 +177,10 @@ fn encode_velocities(
     Some(Temporal { means: Velocity { mins: [range.mins], maxs: [range.maxs], files } })
 }
 
-/// Returns whether velocities of `params` that are stored with 8 bits within `range` keep the position errors within
-/// [`MAX_8_BIT_ERRORS`]. The error of a Gaussian is the one at the time furthest from the center of its time window,
-/// but at most two standard deviations away and within the sequence.
+/// Returns whether 8 bits per axis are enough for the velocities of `params`, whose ranges are `range`: the position
+/// errors must not exceed [`MAX_8_BIT_ERRORS`]. The error of a Gaussian grows with the distance in time from the center
+/// of its window. It is taken at the furthest time within the sequence, but at most two standard deviations from the
+/// center.
 fn are_8_bits_enough(params: &StoredParams, range: &Range3) -> bool {
     let half_step = (0..3).map(|axis| ((range.maxs[axis] - range.mins[axis]) / 510.0).powi(2)).sum::<f64>().sqrt();
     let (mut squares, mut most) = (0.0, 0.0f64);

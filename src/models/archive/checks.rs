@@ -33,10 +33,11 @@ pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
     }
 }
 
-/// Checks that an archive of the compressed model `reduction` of `model` restores this model, and returns the kind of
-/// the restored output. The archive has quantization steps of 2^-16. Every restored Gaussian of every frame must differ
-/// by at most `tolerance` from the compressed model (see [`values`]). The archive must also open as an input, with the
-/// same frames as the restored model.
+/// Checks that an archive restores the compressed model `reduction`, which was made from `model`. The archive has
+/// quantization steps of 2^-16. Returns the kind of output that the archive restores: a model folder, or a file format.
+/// Checks that
+/// - every restored Gaussian of every frame differs by at most `tolerance` from the compressed model (see [`values`]),
+/// - the archive opens as an input, with the same frames as the restored model.
 ///
 /// # Panics
 /// Panics if a check fails.

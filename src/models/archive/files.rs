@@ -1,5 +1,6 @@
-//! Parts of an archive (`.gsz`) that are stored without entropy coding, such as the bytes of a PLY file that belong to
-//! no attribute of a Gaussian.
+//! Archive parts (byte strings of a `.gsz`, each with a name) that are stored without entropy coding. Functions here
+//! store the bytes of a PLY file that belong to no attribute of a Gaussian, write the PLY file of an archive, and
+//! remove the folders of the training machine from YAML texts.
 
 use std::io::{self, Write};
 use std::path::Path;

@@ -35,7 +35,8 @@ const MAX_PATH: usize = 256;
 const DEVICES: [&str; 4] = ["con", "prn", "aux", "nul"];
 /// Beginnings of file names that Windows reserves for devices if a digit follows, such as `com1`.
 const NUMBERED_DEVICES: [&str; 2] = ["com", "lpt"];
-/// Increase of the bits of a half-precision number, read as an integer, if the number doubles (one octave).
+/// Increase of the bits of a half-precision number, read as an integer, when the number is doubled. Doubling is one
+/// octave.
 const BITS_PER_OCTAVE: f32 = 1024.0;
 
 /// Layout of a model in an archive: the files of the model, and which bytes of each file are values.
@@ -58,7 +59,8 @@ pub(super) struct FileLayout {
 }
 
 impl FileLayout {
-    /// Returns whether `path` is the path of this file on a file system that ignores case.
+    /// Returns whether `path` equals the path of this file, ignoring the case of ASCII letters. Both paths would then
+    /// name the same file on some operating systems.
     pub(super) fn has_path(&self, path: &str) -> bool {
         self.path.eq_ignore_ascii_case(path)
     }
@@ -96,8 +98,9 @@ pub(super) enum Field {
     F32(usize),
     /// Value of the plane (scalar component of all Gaussians) with this index, converted to half precision.
     Half(usize),
-    /// Nonnegative half-precision number whose bits are 1024 times the value of the plane (scalar component of all
-    /// Gaussians) with this index. The value in the plane is thus about the binary logarithm of the number plus 15.
+    /// Nonnegative half-precision number on a logarithmic scale. Its bits, read as an integer, are 1024 times the value
+    /// of the plane (scalar component of all Gaussians) with this index. The value of the plane is thus about 15 plus
+    /// the binary logarithm of the number.
     Octaves(usize),
     /// Byte that is 255 times the value of the plane (scalar component of all Gaussians) with this index.
     Byte(usize),
@@ -199,15 +202,15 @@ fn is_plain_char(c: char) -> bool {
     c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | ' ' | '+')
 }
 
-/// Returns `path` with `_` in place of each character that paths in an archive may not have. Returns `None` if an
-/// archive may not have the resulting path either ([`is_plain`]).
+/// Replaces each character of `path` that an archive does not allow by `_` ([`is_plain_char`]; `/` stays). Returns the
+/// resulting path, or `None` if an archive does not allow it for another reason ([`is_plain`]).
 pub(super) fn plain_path(path: &str) -> Option<String> {
     let plain: String = path.chars().map(|c| if c == '/' || is_plain_char(c) { c } else { '_' }).collect();
     is_plain(&plain).then_some(plain)
 }
 
-/// Returns whether an archive may have the path `path`: a relative path of plain names, which stays inside its folder
-/// on every operating system.
+/// Returns whether an archive allows `path` as the path of a file. It must be relative, have at most [`MAX_PATH`]
+/// bytes, stay inside its folder, and have names that every operating system allows.
 fn is_plain(path: &str) -> bool {
     let is_plain_name = |name: &str| {
         let stem = name.split('.').next().unwrap_or_default().to_ascii_lowercase();
@@ -319,9 +322,11 @@ impl Layout {
     }
 }
 
-/// Returns the bytes of `file`, which is file `k` of the model; `None` if its layout does not match the content.
-/// `extra_offset` is an offset within the bytes that each Gaussian has in [`ArchiveContent::extra_bytes`] (stored
-/// unchanged): the offset of the next unused byte. The function advances it past the bytes that this file uses.
+/// Returns the restored bytes of `file`, which is file number `k` of the model. Returns `None` if the layout of the
+/// file does not match the content of the archive.
+///
+/// Archives store some bytes of each Gaussian unchanged ([`ArchiveContent::extra_bytes`]). `extra_offset` is the number
+/// of these bytes, per Gaussian, that earlier files have used. The function adds the number that this file uses.
 fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, extra_offset: &mut usize) -> Option<Vec<u8>> {
     let mut rest = content.files.get(&rest_name(k))?.as_slice();
     let mut out = Vec::new();
@@ -344,9 +349,11 @@ fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, extra_offset:
     Some(out)
 }
 
-/// Appends one row of `fields` per Gaussian to `out`. `extra_offset` is the offset of the next unused byte among the
-/// bytes that each Gaussian has in [`ArchiveContent::extra_bytes`]; it is advanced. Returns `None` if the content of
-/// the archive has no values for a field.
+/// Appends one row for each Gaussian to `out`; a row consists of `fields`. Returns `None` if the content of the archive
+/// has no values for a field.
+///
+/// `extra_offset` is the number of bytes of [`ArchiveContent::extra_bytes`], per Gaussian, that were used before. The
+/// function adds the number that these rows use.
 fn add_rows(content: &ArchiveContent, fields: &[Field], extra_offset: &mut usize, out: &mut Vec<u8>) -> Option<()> {
     let (count, start) = (content.cloud.len(), out.len());
     if count == 0 {

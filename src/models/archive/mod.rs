@@ -49,8 +49,8 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
 };
 
-/// Model formats that an archive stores as files of the format itself, with a layout. The first entry that recognizes
-/// the restored model opens it.
+/// Model formats whose files an archive stores together with a layout, which states how each file is restored. The
+/// first of these formats that recognizes the restored files opens them.
 const FORMATS_WITH_LAYOUT: [ModelFormat; 8] = [
     windowed::FTGS,
     spacetime_gaussians::ENTRY,

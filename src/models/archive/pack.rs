@@ -38,8 +38,8 @@ pub(in crate::models) enum FileContent<'a> {
     Splatv,
     /// Weights of a network: a PyTorch state dict.
     Weights,
-    /// Checkpoint with one row per Gaussian in each of the given tensors. They are tensors of the checkpoint from which
-    /// the model was read; the file is a copy of that checkpoint with the same tree of objects.
+    /// Training checkpoint with Gaussians as rows of tensors. The argument names these tensors in the checkpoint from
+    /// which the model was read. It also applies to this file, a copy of that checkpoint with the same tree of objects.
     Checkpoint(&'a RowTensors),
     /// NumPy archive with Gaussians in its arrays. For an array, the function returns the axis that counts the
     /// Gaussians, and the attribute that the array holds.
@@ -215,9 +215,9 @@ impl Packer {
         Ok(())
     }
 
-    /// Adds the rows of a file to the archive. The file has the content `bytes`, and the rows begin at byte `at`: one
-    /// row of the fields `fields` per Gaussian. Returns the [`Span`] that describes the rows, and their length in
-    /// bytes.
+    /// Adds the rows of a file to the archive, one row per Gaussian. `bytes` is the content of the file, `at` the
+    /// offset of the first row in it, and `fields` describes the fields of a row in order. Returns the [`Span`] (part
+    /// of a file with values) that describes the rows, and their length in bytes.
     fn rows(&mut self, file: &Path, bytes: &[u8], at: usize, fields: &[RowField]) -> Result<(Span, usize)> {
         let count = self.content.cloud.len();
         let stride: usize = fields.iter().map(|field| field.bytes).sum();
@@ -267,9 +267,9 @@ impl Packer {
         Ok((Span { at: at as u64, of: Values::Rows(coded) }, length))
     }
 
-    /// Adds a column with the values `planes`, one plane (scalar component of all Gaussians) after another. Returns the
-    /// index of its first plane, counted over the attributes and all columns. If the name is taken, a number is
-    /// appended to it.
+    /// Adds a column called `name`, with one plane (scalar component of all Gaussians) for each entry of `planes`. If
+    /// another column has this name, a number is appended to it. Returns the index of the first plane of the column;
+    /// indices count the planes of all attributes, then those of all columns.
     fn add_column(&mut self, name: &str, planes: Vec<Vec<f32>>) -> usize {
         let columns = &mut self.content.columns;
         let first = columns.iter().map(|column| column.values.width()).sum::<usize>();
@@ -328,9 +328,11 @@ impl Packer {
         Ok(vec![self.rows(file, bytes, at, &fields)?])
     }
 
-    /// Adds the tensors of a state dict to the archive. A tensor stays bytes of the file if it is not f32, has values
-    /// that are not finite, is not stored contiguously, or shares its values with an earlier tensor. Returns the spans
-    /// (parts of the file with values) that were added, each with its length in bytes.
+    /// Adds the tensors of a state dict to the archive as values. Returns the spans (parts of the file with values)
+    /// that were added, each with its length in bytes. A tensor is stored as unchanged bytes instead if it
+    /// - is not f32, or has values that are not finite,
+    /// - is empty or not stored contiguously,
+    /// - shares bytes of the file with an earlier tensor.
     fn weights(&mut self, name: &str, file: &Path) -> Result<Vec<(Span, usize)>> {
         let checkpoint = Checkpoint::open(file, self.memory)?;
         let mut spans: Vec<(Span, usize)> = Vec::new();
@@ -355,9 +357,10 @@ impl Packer {
         Ok(spans)
     }
 
-    /// Adds the tensors of a checkpoint to the archive. `rows` describes the tensors of the checkpoint from which the
-    /// model was read; `file` was written as a copy of it, so it has the same tree of objects. Returns the spans (parts
-    /// of the file with values) that were added, each with its length in bytes.
+    /// Adds the tensors of the checkpoint at `file`, whose content is `bytes`, to the archive. `rows` describes the
+    /// tensors of the checkpoint from which the model was read. The description also applies to this checkpoint, which
+    /// was written as a copy with the same tree of objects. Returns the spans (parts of the file with values) that were
+    /// added, each with its length in bytes.
     fn checkpoint(&mut self, rows: &RowTensors, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let checkpoint = Checkpoint::open(file, self.memory)?;
         let mut spans = Vec::new();
@@ -472,8 +475,9 @@ impl Packer {
     }
 }
 
-/// Returns the attribute or column of an archive in which the PLY property `name` is stored. `degree`: SH degree of the
-/// model. `has_all_degrees`: whether the properties `f_rest_*` are all coefficients of this degree.
+/// Returns the attribute or the column in which an archive stores the PLY property `name`. `degree` is the SH degree of
+/// the model. `has_all_degrees` states whether the file has as many properties `f_rest_*` as this degree requires; only
+/// then are they stored as SH coefficients.
 fn ply_target(name: &str, degree: usize, has_all_degrees: bool) -> Target {
     let stem = name.trim_end_matches(|c: char| c.is_ascii_digit());
     let number: Option<usize> = name[stem.len()..].parse().ok();
@@ -496,14 +500,15 @@ fn ply_target(name: &str, degree: usize, has_all_degrees: bool) -> Target {
     }
 }
 
-/// Returns the error for a file that an archive cannot hold; `found` describes what the file has instead.
+/// Returns the error for the file at `file`, which cannot be stored in an archive. `found` names the part of its
+/// content that prevents this.
 fn cannot_hold(file: &Path, found: &str) -> Error {
     Error::input(file, "", "a layout that an archive can hold", found)
         .hint("write the model in its own format, or a .gseq of its frames")
 }
 
-/// Returns the range of bytes in the file in which the values of `tensor` are stored, if they follow one another
-/// without gaps; `None` if the file does not hold them.
+/// Returns the range of bytes of the checkpoint file that the values of `tensor` take if they are stored without gaps.
+/// Returns `None` if the file does not hold all of this range.
 fn place_of(checkpoint: &Checkpoint, tensor: &TensorView) -> Option<Range<usize>> {
     let stored = checkpoint.storage_range(&tensor.storage)?;
     let bytes = tensor.kind.bytes();

@@ -1,5 +1,5 @@
-//! Archives of models that are stored as files of their own format: the content of an archive, and the frames of a
-//! decoded archive.
+//! Makes the content of an archive (`.gsz`) from a compressed model, and opens the model in an archive to read its
+//! frames. For model formats whose files an archive stores together with a layout.
 
 use std::path::Path;
 
@@ -16,8 +16,8 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
-/// Function and options with which a model was opened. Archives of the model are opened with the same function and
-/// options.
+/// Function and options with which an input model was opened. They serve to open the model again after it was stored in
+/// an archive (`.gsz`).
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Reopener {
     open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
@@ -36,9 +36,8 @@ impl Reopener {
     }
 
     /// Returns the content of an archive of `reduction`, the compressed form of `model`. The compressed model is first
-    /// written to a temporary folder as an output of the kind `kind`; `name` is its file name if it is a single file.
-    /// `holds` returns the kind of content of each written file, given the path of the file relative to the model
-    /// folder.
+    /// written to a temporary folder, as the kind of output `kind`, to a file or folder called `name`. `holds` returns
+    /// the kind of content of a written file, given the path of the file relative to the model folder.
     ///
     /// # Errors
     /// Fails if the model cannot be written, or if an archive cannot hold its files.

@@ -1,4 +1,5 @@
-//! Tests of layouts in archives: damaged and hostile ones are refused, and files are restored to the byte.
+//! Tests of layouts in archives. A layout states which bytes of each file of a model are stored as values. Damaged and
+//! hostile layouts are refused, and files are restored to the byte.
 
 use std::fs;
 use std::path::Path;
@@ -39,7 +40,7 @@ fn layout() -> Layout {
     Layout { folder: true, files: vec![file("a/model.bin", spans), file("b", Vec::new())] }
 }
 
-/// Returns `content` with the text `text` as the layout of its files.
+/// Returns the archive content `content` with the text `text` in place of its layout, which is stored as JSON.
 fn with_text(mut content: ArchiveContent, text: &str) -> ArchiveContent {
     content.files.insert(LAYOUT.to_owned(), text.as_bytes().to_vec());
     content

@@ -2,9 +2,8 @@
 //!
 //! Files: `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. Each
 //! model format implements how states follow from the network's outputs ([`NetworkMotionModel`]); reading files,
-//! merging Gaussians into proxies and writing are shared. The output is a folder of the same layout with a smaller
-//! point cloud file. The network is copied byte for byte, and so is the configuration, except for the SH degree if that
-//! is lowered.
+//! merging Gaussians and writing are shared. The output is a folder of the same layout with a smaller point cloud file.
+//! The network is copied byte for byte, and so is the configuration, except for the SH degree if that is lowered.
 
 mod arguments;
 mod paths;
@@ -91,7 +90,8 @@ pub(super) struct DeformFolder<L> {
 }
 
 impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
-    /// Opens the model folder `root` of the format `format`. `make` returns its motion model and notes for the user.
+    /// Opens the model folder `root` of the model format `format`. `make` creates the motion model from the files that
+    /// were read, and returns it with notes for the user.
     ///
     /// # Errors
     /// Fails if files are missing or damaged, or if `make` refuses the model.
@@ -126,7 +126,7 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         }))
     }
 
-    /// Returns the text of the input's `cfg_args` file. If its SH degree is higher than `sh_degree`, it is replaced by
+    /// Returns the text of the input's `cfg_args` file, in which an SH degree higher than `sh_degree` is replaced by
     /// `sh_degree`.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         read_for_degree(&self.paths.cfg_args, self.model.info().sh_degree, sh_degree)
@@ -157,7 +157,8 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
     }
 }
 
-/// Returns the id of the member of `cluster` with the largest weight; the first such member in a tie.
+/// Returns the id of the Gaussian that has the largest weight in `cluster` (Gaussians merged into one); the first such
+/// Gaussian in a tie.
 fn heaviest(cluster: &Cluster) -> u32 {
     let first = (cluster.leader, f64::NEG_INFINITY);
     cluster.members.iter().fold(first, |most, &member| if member.1 > most.1 { member } else { most }).0

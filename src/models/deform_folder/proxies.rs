@@ -2,9 +2,9 @@
 //!
 //! The network's output depends on the canonical position of a Gaussian, so the position of a proxy is searched for and
 //! not averaged. Candidates are the positions of the members (merged Gaussians) with the largest weights, and the mean
-//! of all members. The target at a frame is the moment match of the members. The candidate whose path is nearest to the
-//! target is improved by Gauss-Newton steps. Scale and rotation are then the target values minus the network's output
-//! at that position, on average over sampled frames.
+//! of all members. The target at a frame is the moment match of the members: the Gaussian with the mean and covariance
+//! of their mixture. The candidate whose path is nearest to the target is improved by Gauss-Newton steps. Scale and
+//! rotation are then the target values minus the network's output at that position, on average over sampled frames.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
@@ -29,8 +29,9 @@ const STEPS: usize = 2;
 /// Number of times that scale and rotation of a proxy (Gaussian that replaces merged ones) are corrected toward its
 /// target state.
 const CORRECTIONS: usize = 3;
-/// Damping of a Gauss-Newton step: this fraction of the mean of the matrix's diagonal is added to the diagonal. If the
-/// position moves alike in all frames, the matrix is well conditioned; otherwise a shorter step is better.
+/// Damping of a Gauss-Newton step: this fraction of the mean diagonal element of the normal matrix is added to each
+/// diagonal element. It hardly changes a step if the position moves alike in all frames, because the matrix is then
+/// well conditioned; otherwise it shortens the step.
 const DAMPING: f64 = 1e-3;
 
 /// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`, one row
@@ -108,9 +109,9 @@ fn position(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// Returns for every Gaussian of `raw` the squared distance between its computed position and its target position,
-/// summed over `frames`, in scene units squared. `wanted(k, row)` returns the target position of the Gaussian in row
-/// `row` at frame `frames[k]`.
+/// Returns for each Gaussian of `raw` (stored parameters) the squared distance between the position that `model`
+/// computes and its target position, summed over `frames`, in scene units squared. `wanted(k, row)` returns the target
+/// position at frame `frames[k]` of the Gaussian in row `row`.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -163,13 +164,14 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     Ok(better)
 }
 
-/// Sets all stored parameters of the proxies `made` (Gaussians that replace merged ones) except their positions.
-/// `wanted` holds the target states of all proxies, one entry for each of `frames`.
+/// Computes all stored parameters of the proxies `made` (Gaussians that replace merged ones) except their positions,
+/// and writes them to `made`. `wanted` holds the target states of all proxies, one entry for each of `frames`.
+/// `leaders` holds the id of the most important member of each cluster.
 ///
-/// The parameters start as those of the `leaders` (the most important member of each cluster). Then they are corrected
-/// [`CORRECTIONS`] times: the difference between the target and the state of the proxy, averaged over `frames`, is
-/// added. One correction suffices if the network's output is simply added; quaternions that are not normalized need
-/// several. Each proxy keeps the scale and rotation of the correction with the smallest difference from the target.
+/// The parameters start as those of the leaders. Then they are corrected [`CORRECTIONS`] times: the difference between
+/// the target and the state of the proxy, averaged over `frames`, is added. One correction suffices if the network's
+/// output is simply added; quaternions that are not normalized need several. Each proxy keeps the scale and rotation of
+/// the correction with the smallest difference from the target.
 fn fit_parameters<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     made: &mut StoredParams,
@@ -211,19 +213,20 @@ fn fit_parameters<L: NetworkMotionModel>(
     Ok(())
 }
 
-/// Difference between the target state and the state of one proxy (target minus state), summed over frames.
+/// Target state minus actual state of one proxy (Gaussian that replaces merged ones), summed over frames.
 #[derive(Clone, Copy, Default)]
 struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squared difference between target and proxy, in log scales and in unit quaternions, summed over frames and over
-    /// the components of both.
+    /// Squared difference between a proxy (Gaussian that replaces a merged cluster) and its target, in log scales and
+    /// in unit quaternions, summed over frames and over the components of both.
     off: f64,
 }
 
 impl StateDifference {
-    /// Adds the difference at one frame: row `row` of `wanted` (the target states) minus row `row` of `state`.
+    /// Adds the difference of one proxy (Gaussian that replaces a merged cluster) at one frame: its target state (row
+    /// `row` of `wanted`) minus its state (row `row` of `state`).
     fn add(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
         let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
         for c in 0..3 {
@@ -242,8 +245,8 @@ impl StateDifference {
         self.opacity += to - from;
     }
 
-    /// Adds the mean of the summed differences to the stored parameters in row `row` of `to`. `share` is 1 / number of
-    /// summed frames.
+    /// Adds the mean difference per frame to the stored parameters of the proxy (Gaussian that replaces a merged
+    /// cluster) in row `row` of `to`. `share` is 1 divided by the number of frames that were added.
     fn apply<L: NetworkMotionModel>(&self, share: f64, to: &mut Gaussians, row: usize) {
         let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
         let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(MIN_SCALE).ln() as f32);

@@ -37,7 +37,7 @@ struct TestModel {
 }
 
 impl TestModel {
-    /// Creates a model of Deformable-3D-Gaussians.
+    /// Creates a model of Deformable-3D-Gaussians whose network has random weights and the variant `kind`.
     fn deformable(kind: DeepVariant) -> TestModel {
         let stripped = |(name, tensor): (String, Tensor)| (name.replace("network.", ""), small(tensor));
         TestModel {
@@ -52,7 +52,8 @@ impl TestModel {
         }
     }
 
-    /// Creates a model of SC-GS with 12 control nodes, 2 features per Gaussian (`hyper_dim`) and a motion mask.
+    /// Creates a model of SC-GS with 12 control nodes, 2 features per Gaussian (`hyper_dim`), a motion mask (factor on
+    /// the motion of each Gaussian), and a network with random weights and the variant `kind`.
     fn sc_gs(kind: DeepVariant) -> TestModel {
         let mut noise = Noise(23);
         let mut add = |shape: &[usize]| Tensor {
@@ -118,7 +119,8 @@ impl TestModel {
     }
 }
 
-/// Scales the weights of the network's last layers so that Gaussians move by some tenths of a scene unit.
+/// Returns `tensor`, multiplied by 0.1 if it belongs to a last layer of the network (fewer than 5 outputs). Gaussians
+/// then move by some tenths of a scene unit.
 fn small(mut tensor: Tensor) -> Tensor {
     // Heads are recognized by their few outputs.
     if tensor.shape[0] < 5 {

@@ -132,9 +132,9 @@ impl MotionModel for DeformableMotion {
         Ok(())
     }
 
-    /// Returns the derivative of the positions at `time` with respect to the stored positions. For all other attributes
-    /// the derivative counts as the identity. That of rotation and scales is not computed, because the decomposition of
-    /// the covariance into rotation and scales is not continuous from frame to frame.
+    /// Returns the derivative of the positions at `time` with respect to the stored positions. All other derivatives
+    /// count as the identity. Derivatives of rotation and scales are not computed, because the decomposition of the
+    /// covariance into rotation and scales is not continuous from frame to frame.
     fn jacobian(
         &self,
         time: f64,

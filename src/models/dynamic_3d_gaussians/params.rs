@@ -180,7 +180,7 @@ impl FrameSource for Params {
     }
 }
 
-/// Reader of some Gaussians, frame by frame.
+/// Reader of the states of the Gaussians `ids` of a `params.npz` file, one frame at a time.
 struct TrajectoryBlock<'a> {
     params: &'a Params,
     ids: Vec<usize>,

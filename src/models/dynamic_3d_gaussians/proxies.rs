@@ -1,8 +1,9 @@
 //! Computes proxies (Gaussians that replace merged ones) for a model where positions, rotations and colors vary freely,
 //! but scales and opacities are constant in time.
 //!
-//! Position, rotation and color of a proxy are the moment match of its members (merged Gaussians) at every frame. For
-//! scale and opacity, the moment matches are averaged over time.
+//! Position, rotation and color of a proxy are the moment match of its members (merged Gaussians) at every frame: the
+//! Gaussian with the mean and covariance of their mixture. For scale and opacity, the moment matches are averaged over
+//! time.
 
 use super::params::Params;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies};
@@ -74,8 +75,8 @@ impl<'a> MergedSource<'a> {
         MergedSource { merged: merged(params, reduction), reduction, info }
     }
 
-    /// Finds the proxies (Gaussians that replace merged ones) among the output Gaussians with the indices `places`.
-    /// Returns for each of them its position in the list `places` and the index of its cluster.
+    /// Finds the proxies (Gaussians that replace merged ones) among the output Gaussians whose indices `places` lists.
+    /// Returns a pair for each proxy: its position in this list, and the index of its cluster (merged Gaussians).
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
         let clusters = &self.reduction.clusters;
         let mut by_output: Vec<(u32, usize)> =
@@ -85,8 +86,8 @@ impl<'a> MergedSource<'a> {
         places.enumerate().filter_map(|(row, place)| Some((row, by_output[found(place)?].1))).collect()
     }
 
-    /// Returns a reader that reads the Gaussians `ids` from `reader` and then sets the scales and opacities of proxies
-    /// (Gaussians that replace merged ones) to their constant values.
+    /// Returns a reader of the output Gaussians `ids`. It reads them with `reader`, then replaces the scales and
+    /// opacities of proxies (Gaussians that replace merged ones) by their constant values.
     fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
         let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
         Box::new(MergedReader { reader, proxies: self.proxies(ids.iter()), raw })
@@ -116,7 +117,8 @@ impl FrameSource for MergedSource<'_> {
 /// values.
 struct MergedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    /// For each proxy that is read: its row among the Gaussians that are read, and the index of its cluster.
+    /// For each proxy (Gaussian that replaces merged ones) among the Gaussians that are read: its position among them,
+    /// and the index of its cluster.
     proxies: Vec<(usize, usize)>,
     raw: Option<&'a Gaussians>,
 }

@@ -84,7 +84,8 @@ fn states_are_the_array_values_compressed_or_not() {
     assert_eq!((0..5).map(|id| model.class(id)).collect::<Vec<_>>(), [0, 0, 0, 1, 1]);
 }
 
-/// Writes the file `path` with the array `log_scales` as f64 values of the type `kind` in the order `order`.
+/// Writes the test model to the `.npz` file `path`, with the array `log_scales` as f64. `kind` is the NumPy type of
+/// this array with its byte order, such as `<f8`, and `order` the order of its elements (C or Fortran).
 fn write_with_doubles(path: &Path, kind: &str, order: npyz::Order) {
     let mut npz = NpzWriter::new(File::create(path).unwrap());
     for (name, shape, values) in &arrays() {

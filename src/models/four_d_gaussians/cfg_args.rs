@@ -203,7 +203,8 @@ pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) 
 }
 
 /// Returns the text of the `cfg_args` file at `path` for an output with SH degree `degree`. `own` is the SH degree of
-/// the model; the text is unchanged unless `degree` is lower. Fails if the file cannot be read.
+/// the input. If `degree` is lower, it replaces the SH degree in the text; otherwise the text is unchanged. Fails if
+/// the file cannot be read.
 pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
     let text = read(path)?;
     if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }

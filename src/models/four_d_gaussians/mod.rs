@@ -241,7 +241,7 @@ impl InputModel for ModelFolder {
 }
 
 impl ModelFolder {
-    /// Returns the text of the input's `cfg_args` file. If its SH degree is higher than `sh_degree`, it is replaced by
+    /// Returns the text of the input's `cfg_args` file, in which an SH degree higher than `sh_degree` is replaced by
     /// `sh_degree`.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         cfg_args::read_for_degree(&self.paths().cfg_args, self.info().sh_degree, sh_degree)

@@ -15,13 +15,15 @@ use crate::source::FrameSource;
 /// Maximum number of frames at which a proxy is compared with its members (the Gaussians that it replaces).
 const SAMPLED_FRAMES: usize = 16;
 
-/// Returns the stored parameters of the proxies of the clusters `all`: the state of each proxy at the reference frame,
-/// minus the changes (deltas) that the field makes at the canonical position of its leader (the most important member
-/// of its cluster).
+/// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of the clusters `all`. They
+/// are the merged state of the cluster at the reference frame, minus the changes (deltas) that the field makes there at
+/// the canonical position of the leader (the most important member of the cluster).
 ///
-/// A proxy placed at the mean of its members is moved by the field at the mean, not by the field at the members. If it
-/// drifts further than `max_drift` from its members, it is placed at its leader's canonical position; its shape about
-/// the mean stays the same. A proxy without a finite solution gets all parameters of its leader.
+/// The field at the mean of the members moves a proxy that is placed there, so it may drift away from its members.
+/// There are two exceptions:
+/// - If a proxy placed at the mean drifts further than `max_drift` from its members, it is placed at its leader's
+///   canonical position. Its shape about the mean stays the same.
+/// - A proxy without a finite solution gets all parameters of its leader.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -77,7 +79,8 @@ pub(super) fn solve(
     Ok(Proxies { raw: Some(raw.into()), deviation, notes, ..Proxies::default() })
 }
 
-/// Returns the states of the proxies of `clusters` at the reference frame, merged from the states of their members.
+/// Returns for each of `clusters` the state of its proxy (Gaussian that replaces merged ones) at the reference frame.
+/// It is merged from the states of the members.
 fn merged_states(
     model: &ModelFolder,
     reference: ReferenceFrame,
@@ -101,10 +104,11 @@ fn merged_states(
     Ok(states)
 }
 
-/// Returns the `states` of proxies with every quaternion scaled to the length of the quaternion that its leader (the
-/// most important member of its cluster) has at the same frame. The field adds its delta to the stored quaternion, so
-/// the angle of rotation depends on the length. The states of the leaders are computed from their stored parameters
-/// `of_leaders` and from `deltas`.
+/// Returns `states`, the states of proxies (Gaussians that replace merged clusters), in which every quaternion is
+/// scaled to the length that the quaternion of the proxy's leader (the most important member of the cluster) has at the
+/// same frame. The length matters because the field adds its delta to the stored quaternion, so the angle of rotation
+/// depends on the length. `of_leaders` holds the stored parameters of the leaders, `deltas` the changes that the field
+/// makes to them at this frame.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);
@@ -142,10 +146,12 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     unsolved.len()
 }
 
-/// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in
-/// scene units. The expected position is the weighted mean of the members of its cluster. If the proxy was placed at
-/// the leader of the cluster (its most important member), the offset of the leader from this mean at the reference
-/// frame is added to the expected position.
+/// Returns for each proxy (Gaussian that replaces a merged cluster) the largest distance, over sampled frames, between
+/// its position and its expected position, in scene units. `placements` states where each proxy was placed; the
+/// expected position at a frame follows from it:
+/// - Placed at the mean: the weighted mean of the members of its cluster.
+/// - Placed at the leader (the most important member): this mean, plus the offset of the leader from the mean at the
+///   reference frame.
 fn deviations(
     model: &ModelFolder,
     reference: ReferenceFrame,

@@ -29,8 +29,9 @@ pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
     tensors
 }
 
-/// Returns the tensors in compact form. `from_zero` states that the field is never read at times below 0; rows of time
-/// planes that are then never read share the storage of other rows.
+/// Returns the tensors of a deformation field in compact form. `from_zero` states that the field is never read at times
+/// below 0. Rows of time planes (feature planes over time) for these times are then never read either, and share the
+/// storage of other rows.
 pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
     let pack = |shares: bool| -> Vec<StoredTensor> {
         let pack = |(name, tensor): (&String, &Tensor)| match shares {
@@ -48,7 +49,7 @@ pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
 }
 
 /// Returns the compact form of the tensor called `name`. `from_zero` states that the field is never read at times below
-/// 0, so that some rows of time planes need no storage of their own.
+/// 0. Rows of time planes (feature planes over time) for these times then get no storage of their own.
 fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     let is_first = |value: &f32| value.to_bits() == tensor.data[0].to_bits();
     if tensor.data.len() > 1 && tensor.data.iter().all(is_first) {

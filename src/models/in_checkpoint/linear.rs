@@ -1,10 +1,13 @@
-//! Computes proxies (Gaussians that replace merged ones) for models whose Gaussians move along straight lines and fade
-//! with the distance in time.
+//! Computes path, temporal window and shape of proxies (Gaussians that replace merged ones), for models whose Gaussians
+//! move along straight lines and fade with the distance in time. [`match_proxies`] computes them from the members
+//! (merged Gaussians):
 //!
-//! Paths are blended exactly: the members (merged Gaussians) are re-centered to the proxy's time and averaged by
-//! weight, so that the proxy is at the weighted mean of its members at every time. The temporal windows of the members
-//! are blended by their moments, each with its weight times its duration. Shape and opacity are fitted to the moment
-//! matches of the members at sampled frames (least squares). Source: method.md, section 5.6, for the match at a frame.
+//! - Path: the straight paths of the members are expressed around the proxy's center in time and averaged by weight.
+//!   This is exact: the proxy is at the weighted mean of its members at every time.
+//! - Temporal window: has the mean and the variance in time of the members' windows, each of which counts with its
+//!   weight times its duration.
+//! - Shape and opacity: fitted by least squares to the moment matches of the members at sampled frames. The moment
+//!   match is the Gaussian with the mean and covariance of their mixture (method.md, section 5.6).
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -38,7 +41,8 @@ pub(in crate::models) struct LinearPath {
 }
 
 impl LinearPath {
-    /// Returns the weighted mean of the paths and windows of `members`, whose weights sum to 1.
+    /// Returns the weighted mean of the paths and windows of `members`. Each member is a weight, and a path with its
+    /// window; the weights sum to 1.
     pub(in crate::models) fn blended(members: &[(f64, LinearPath)]) -> LinearPath {
         let total_duration: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
         let mean = |value_of: &dyn Fn(&LinearPath) -> f64| {
@@ -58,19 +62,20 @@ impl LinearPath {
     }
 }
 
-/// Path, temporal window and shape of a proxy, matched to its members (merged Gaussians) over the sampled frames.
+/// Path, temporal window and shape of a proxy (Gaussian that replaces others), matched to its members (the merged
+/// Gaussians) over the sampled frames.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Matched {
     /// Path and temporal window of the proxy: the weighted mean of the paths and windows of its members (merged
     /// Gaussians), with the weights of the cluster. See [`LinearPath::blended`].
     pub(in crate::models) line: LinearPath,
-    /// Opacity logit at the center of the window, and spatial covariance (xx xy xz yy yz zz). `None` if the proxy is
-    /// visible at no sampled frame.
+    /// Opacity logit at the center of the window, and spatial covariance (xx xy xz yy yz zz). `None` if the proxy
+    /// (Gaussian that replaces merged ones) is visible at no sampled frame.
     pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
-/// State that one proxy should have at one frame: the moment match of its members, that is, the Gaussian with the mean
-/// and covariance of their mixture.
+/// State that one proxy (Gaussian that replaces merged ones) should have at one frame: the moment match of its members
+/// (the merged Gaussians), that is, the Gaussian with the mean and covariance of their mixture.
 pub(in crate::models) struct ProxyAtFrame<'a> {
     /// Index of the proxy's cluster.
     pub(in crate::models) proxy: usize,
@@ -80,19 +85,22 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) time: f64,
     /// Weight of the frame: window of the proxy times opacity of the moment match (see [`ProxyAtFrame`]).
     pub(in crate::models) weight: f64,
-    /// States of a block of proxies at this frame. The state of each proxy is the moment match of its members.
+    /// States of a block of proxies (Gaussians that replace merged ones) at this frame: the moment matches of their
+    /// members (see [`ProxyAtFrame`]).
     pub(in crate::models) state: &'a Gaussians,
     /// Row of this proxy in `state`.
     pub(in crate::models) row: usize,
 }
 
-/// Computes for each of `clusters` the path, temporal window and shape of its proxy from its members (merged
-/// Gaussians). The moment match of the members at a frame is the Gaussian with the mean and covariance of their
-/// mixture.
+/// Computes the path, temporal window and shape of one proxy (Gaussian that replaces merged ones) for each of
+/// `clusters`. Each model format with linear motion converts them to its own stored parameters. At sampled frames, a
+/// proxy is compared with the moment match of its members (merged Gaussians): the Gaussian with the mean and covariance
+/// of their mixture.
 ///
-/// `line_of` returns the path and window of a member by its id; `window` returns the value of a window at a time. Calls
-/// `visit` with the moment match of each proxy at each sampled frame at which the proxy is visible. The moment match
-/// has the attributes `wanted`, and always rotation, scale and opacity.
+/// - `line_of(id)` returns the path and window of the member `id`.
+/// - `window(line, time)` returns the value of the window of `line` at `time`.
+/// - `visit` is called with the moment match for each proxy, at each sampled frame at which the proxy is visible. The
+///   moment match has the attributes `wanted`, and always rotation, scale and opacity.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -135,8 +143,9 @@ pub(in crate::models) fn match_proxies(
     Ok(matched)
 }
 
-/// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match (see
-/// [`ProxyAtFrame`]).
+/// Sums over the sampled frames of one proxy (Gaussian that replaces merged ones), from which its opacity and
+/// covariance are computed. At each frame, m is the value of the proxy's temporal window and α the opacity of its
+/// moment match (see [`ProxyAtFrame`]).
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
     /// Sum over the frames of m·α, the window times the opacity.
@@ -148,9 +157,9 @@ struct FrameSums {
 }
 
 impl FrameSums {
-    /// Adds one frame to the sums. Row `row` of `state` is the moment match of the members at this frame (the Gaussian
-    /// with the mean and covariance of their mixture), `m` is the value of the proxy's temporal window, and `alpha` the
-    /// opacity of the moment match.
+    /// Adds one frame to the sums. Row `row` of `state` is the moment match of the merged Gaussians at this frame (the
+    /// Gaussian with the mean and covariance of their mixture), `m` is the value of the temporal window of the proxy
+    /// (Gaussian that replaces them), and `alpha` the opacity of the moment match.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
@@ -159,8 +168,9 @@ impl FrameSums {
         self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
-    /// Returns two averages over the added frames: the opacity logit of the proxy at the center of its temporal window,
-    /// and the covariance (xx, xy, xz, yy, yz, zz). Returns `None` if no frame was added.
+    /// Returns two averages over the added frames: the opacity logit of the proxy (Gaussian that replaces merged ones)
+    /// at the center of its temporal window, and the covariance (xx, xy, xz, yy, yz, zz). Returns `None` if no frame
+    /// was added.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
         let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));

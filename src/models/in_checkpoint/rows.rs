@@ -37,7 +37,8 @@ impl RowElement {
         (first..first + count).map(RowElement::Own).collect()
     }
 
-    /// Returns the values that all Gaussians have for this element; `None` for [`RowElement::Unread`].
+    /// Returns the values that `raw` holds for this element of a row, one per Gaussian; `None` for
+    /// [`RowElement::Unread`].
     fn get(self, raw: &StoredParams) -> Option<&[f32]> {
         match self {
             RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
@@ -146,7 +147,8 @@ impl CheckpointReader {
         Ok(())
     }
 
-    /// Records the tensor at the node `id` as one that only the training reads, if it has one row per Gaussian.
+    /// Adds the tensor at the node `id` of the checkpoint to the list of tensors that only the training reads. Ignores
+    /// a tensor that does not have one row per Gaussian.
     pub(in crate::models) fn add_training_tensor(&mut self, id: NodeId) {
         let tensor =
             self.tensors.checkpoint.tensor(id).filter(|tensor| tensor.shape.first() == Some(&self.tensors.count));
@@ -177,9 +179,9 @@ impl RowTensors {
         self.training_only.iter().map(|tensor| tensor.id)
     }
 
-    /// Writes the checkpoint of the compressed model to `path`. `raw_left` holds the parameters of the compressed
-    /// model, `before` the original ones; values are copied byte for byte where both agree. In tensors that only the
-    /// training reads, the rows of merged Gaussians become zero.
+    /// Writes the checkpoint of the compressed model to `path`. `before` holds the parameters of the original
+    /// Gaussians, `raw_left` those of the Gaussians in `reduction`. A row is copied byte for byte if both agree. In
+    /// tensors that only the training reads, the rows of proxies (Gaussians that replace merged ones) become zero.
     ///
     /// # Errors
     /// Fails if a tensor cannot be read or a write fails.

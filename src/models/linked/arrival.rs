@@ -1,6 +1,7 @@
-//! Frames that did not come from PLY files of the user. They are saved as PLY files and then linked: their Gaussians
-//! are matched across frames. The source is a frame stream without ids (format/STREAM.md, version 2), or an input that
-//! identifies Gaussians across frames and is linked anew at the user's request.
+//! Links frames that the user did not give as PLY files: saves them as temporary PLY files, then matches their
+//! Gaussians across frames. There are two sources of such frames:
+//! - a frame stream without ids of Gaussians (format/STREAM.md, version 2),
+//! - an input that identifies Gaussians across frames, if the user asks to link it anew.
 //!
 //! Memory while frames arrive: one frame; for a container up to 128 MiB of visible Gaussians, and for each thread a
 //! tile (block of Gaussians × frames) of every column. Disk space, in a temporary folder: every frame as PLY.
@@ -57,9 +58,11 @@ impl ReceivedFrames {
         Ok(())
     }
 
-    /// Links the Gaussians of the received frames into tracks (Gaussians followed through frames). If `joins`, tracks
-    /// that seem to be the same Gaussian are joined. `kind` is the name of the original input format, `bytes` the size
-    /// of the original input, `name` what messages call the input, and `why` the reason for linking.
+    /// Links the Gaussians of the received frames into tracks (Gaussians followed through frames).
+    /// - `kind`, `bytes`: name of the format of the original input, and its size in bytes.
+    /// - `name`: name of the input in messages.
+    /// - `why`: reason for linking, for notes to the user.
+    /// - `joins`: whether tracks that seem to be the same Gaussian are joined.
     fn link(
         self,
         kind: &'static str,
@@ -77,8 +80,8 @@ impl ReceivedFrames {
 }
 
 impl LinkedFrames {
-    /// Receives a whole stream, which messages call `name`, and links the Gaussians of its frames into tracks. If
-    /// `joins`, tracks that seem to be the same Gaussian are joined.
+    /// Receives a whole stream, which messages call `name`, and links the Gaussians of its frames into tracks
+    /// (Gaussians followed through frames). `joins` states whether tracks that seem to be the same Gaussian are joined.
     ///
     /// # Errors
     /// Fails if the stream is damaged or has no frames, or if a write fails.
@@ -103,9 +106,9 @@ impl LinkedFrames {
         received.link("linked frame stream", name, stream.received_bytes(), why, joins, options)
     }
 
-    /// Links the Gaussians of the frames of `input` anew into tracks, ignoring which Gaussian is which in the input.
-    /// Each frame consists of the Gaussians that may be visible in it. If `joins`, tracks that seem to be the same
-    /// Gaussian are joined. `kind` is the name of the input format.
+    /// Links the Gaussians of the frames of `input` anew into tracks (Gaussians followed through frames), ignoring
+    /// which Gaussian is which in the input. Each frame consists of the Gaussians that may be visible in it. `joins`
+    /// states whether tracks that seem to be the same Gaussian are joined. `kind` is the name of the input format.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a write fails.
@@ -183,7 +186,8 @@ fn count_visible_rows(source: &dyn FrameSource) -> Result<Vec<u64>> {
     blocks(source).map(count).try_reduce(|| vec![0; frames], add)
 }
 
-/// Returns, for each block of consecutive Gaussians, its visible Gaussians ([`visible_rows`]) in each of `frames`.
+/// Reads the visible Gaussians ([`visible_rows`]) of `source` at each of `frames`. Returns for each block of
+/// consecutive Gaussians a list with one entry per frame: the visible Gaussians of the block at this frame.
 fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
     let wanted = ReadPlan::new(frames.clone());
     let unpack = |range: Range<usize>| {

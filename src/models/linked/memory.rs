@@ -13,11 +13,11 @@ use crate::tracking::{Joiner, Linker};
 /// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time; a single frame may be
 /// larger.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
-/// Bytes of memory per Gaussian of a frame in the list of the (track, row) pairs of the frame, and in a copy of this
-/// list for sorting.
+/// Bytes of memory that each Gaussian of a frame takes in two lists: the (track, row) pairs of the frame, and a sorted
+/// copy of them.
 const BYTES_PER_ROW: u64 = 16;
-/// Number of frames that are rendered before and after tracks are joined or attributes are made constant, to measure
-/// the change.
+/// Number of frames that are rendered before and after tracks (Gaussians followed through frames) are joined or
+/// attributes are made constant, to measure the change.
 pub(super) const SAMPLED_FRAMES: usize = 3;
 /// Bytes of memory of two renders by a virtual camera and of their comparison.
 const RENDER_BYTES: u64 = 16 << 20;
@@ -82,7 +82,7 @@ impl Sizes {
     }
 
     /// Returns the bytes of memory that making attributes constant takes: the memory of the open frames, the first row
-    /// and the length of each track, and the larger of two steps:
+    /// and the length of each track (Gaussian followed through frames), and the larger of two steps:
     /// - computing means, which takes sums for a batch of tracks and one frame per thread,
     /// - rendering, which takes the sampled frames before and after the change, and their renders.
     ///

@@ -15,14 +15,15 @@ use crate::model::{Attributes, Gaussians};
 use crate::render::Renderer;
 use crate::tracking::{Joiner, Linker};
 
-/// Minimum PSNR in dB of renders after a change (tracks joined, attributes made constant) against renders before it.
+/// Minimum PSNR in dB of renders after a change (tracks of one Gaussian joined, attributes made constant) against
+/// renders before it.
 const MIN_PSNR_DB: f64 = 40.0;
 /// Number of virtual cameras by which each sampled frame is rendered.
 const VIEWS: usize = 3;
-/// Maximum deviations from the mean, along a track, of attributes that become constant. Colors range from 0 to 1;
-/// `other` limits natural logs of scales, rotations in radians, and opacities. The entries are tried in this order
-/// until renders reach [`MIN_PSNR_DB`]. The first entry has the size of the differences that trainers leave between
-/// tracks of one Gaussian, the second is half as large.
+/// Maximum deviations of an attribute from its mean along a track (Gaussian followed through frames) for which it
+/// becomes constant. Colors range from 0 to 1; `other` limits natural logs of scales, rotations in radians, and
+/// opacities. The entries are tried in this order until renders reach [`MIN_PSNR_DB`]. The first entry is about as
+/// large as the differences that trainers leave between tracks of one Gaussian; the second is half as large.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
 /// Joins tracks (Gaussians followed through frames) that seem to be the same Gaussian. Tries the proposals of `joiner`
@@ -55,8 +56,9 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -
     Ok(note)
 }
 
-/// Replaces nearly constant attributes of `tracks` by their means, with the first of [`STEADY_BOUNDS`] with which
-/// renders reach [`MIN_PSNR_DB`]. Returns a note for the user if any attribute became constant.
+/// Replaces nearly constant attributes of `tracks` (Gaussians followed through frames) by their means, with the first
+/// of [`STEADY_BOUNDS`] with which renders reach [`MIN_PSNR_DB`]. Returns a note for the user if any attribute became
+/// constant.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or a write to the folder `scratch` fails.
@@ -93,9 +95,9 @@ pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<O
     Ok(None)
 }
 
-/// Returns, for each track of `range` (Gaussian followed through frames), the sums over all frames from which the means
-/// of its attributes are computed. Reads only frames from `born` on, because no track of `range` begins before frame
-/// `born`.
+/// Returns the sums over all frames from which the means of attributes are computed, for each track (Gaussian followed
+/// through frames) with an index in `range`. Reads only frames from `born` on, because none of these tracks begins
+/// before frame `born`.
 fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<TrackSums> {
     let sh_degree = tracks.frames().sh_degree();
     let (mut sums, mut state) = (TrackSums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
@@ -109,7 +111,8 @@ fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<Track
 }
 
 /// Returns the PSNR in dB of renders with joined tracks (Gaussians followed through frames) against renders with
-/// separate tracks. Returns `None` if no frame has a track with several Gaussians, which would be blended into one.
+/// separate tracks. Returns `None` if joining changes no frame, because no joined track has several Gaussians in one
+/// frame.
 fn joining_psnr(tracks: &LinkedTracks) -> Result<Option<f64>> {
     let frames = tracks.lengths()?.blended;
     if frames.is_empty() {

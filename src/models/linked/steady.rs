@@ -27,7 +27,8 @@ const STEADY_COLUMNS: Attributes = Attributes::all().difference(Attributes::POSI
 /// Maximum number of tracks (Gaussians followed through frames) whose means a thread computes together.
 pub(super) const BATCH: usize = 1 << 16;
 
-/// Maximum root mean square deviation from the mean, along a track, of an attribute that becomes constant.
+/// Maximum root mean square deviation from the mean, along a track (Gaussian followed through frames), of an attribute
+/// that becomes constant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bound {
     /// Maximum deviation of colors, whose values range from 0 to 1.
@@ -87,13 +88,13 @@ impl Steady {
         })
     }
 
-    /// Returns whether any attribute of `track` is constant.
+    /// Returns whether any attribute of the track with index `track` (Gaussian followed through frames) is constant.
     pub(super) fn has_steady(&self, track: u32) -> bool {
         !self.columns[track as usize].is_empty()
     }
 
-    /// Returns the constant attributes of `tracks` and their values, in the order of `tracks`. Fast if `tracks` are in
-    /// increasing order.
+    /// Returns which attributes are constant along each of `tracks` (indices of Gaussians followed through frames), and
+    /// the values of these attributes, in the order of `tracks`. Fast if the indices increase.
     ///
     /// # Errors
     /// Fails if a read of the means fails.
@@ -117,8 +118,9 @@ impl Steady {
 }
 
 impl HeldMeans {
-    /// Writes the values of constant attributes to `state`. Each pair in `places` is the index of a track within this
-    /// list of tracks (Gaussians followed through frames), and the row of that track in `state`.
+    /// Writes the values of constant attributes to `state`. Each pair in `places` is the position of a track (Gaussian
+    /// followed through frames) in the list that was given to [`Steady::means`], and the row of `state` that holds this
+    /// track.
     pub(super) fn write_to(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
         for column in STEADY_COLUMNS.iter() {
@@ -136,7 +138,8 @@ impl HeldMeans {
 /// frame.
 pub(super) struct TrackSums {
     sh_width: usize,
-    /// For each track its number of frames, the sum over these frames of the opacity α, and the sum of α².
+    /// For each track (Gaussian followed through frames) its number of frames, the sum over these frames of the opacity
+    /// α, and the sum of α².
     opacity: Vec<[f64; 3]>,
     /// For each track the sum over frames of α·v, where α is the opacity, for each component v of the attributes
     /// [`STEADY_COLUMNS`].
@@ -148,12 +151,12 @@ pub(super) struct TrackSums {
     /// For each track and color channel the sum over frames of α·Σₖ vₖ², where α is the opacity and vₖ are the SH
     /// coefficients.
     colors: Vec<[f64; 3]>,
-    /// First quaternion of each track; later quaternions get the sign nearest to it.
+    /// First quaternion of each track. A later quaternion q is replaced by −q if that is nearer to the first one.
     first: Vec<[f32; 4]>,
 }
 
 impl TrackSums {
-    /// Creates sums for `len` tracks, without any frame yet.
+    /// Creates sums for `len` tracks (Gaussians followed through frames); no frame has been added yet.
     pub(super) fn new(len: usize, sh_degree: usize) -> TrackSums {
         TrackSums {
             sh_width: Attributes::SH.width(sh_degree),
@@ -166,7 +169,7 @@ impl TrackSums {
         }
     }
 
-    /// Returns the bytes of memory that the sums of one track take.
+    /// Returns the bytes of memory that the sums of one track (Gaussian followed through frames) take.
     pub(super) fn bytes(sh_degree: usize) -> u64 {
         (8 * (3 + STEADY_COLUMNS.width(sh_degree) + 4 + 3 + 3) + 16) as u64
     }
@@ -213,15 +216,16 @@ impl TrackSums {
         }
     }
 
-    /// Returns the means of the attributes [`STEADY_COLUMNS`] of `track` over its frames.
+    /// Returns the means of the attributes [`STEADY_COLUMNS`] of track `track` (Gaussian followed through frames) over
+    /// its frames, component by component.
     fn means(&self, track: usize) -> Vec<f32> {
         let width = self.values.len() / self.opacity.len();
         let [_, weight, _] = self.opacity[track];
         self.values[track * width..][..width].iter().map(|sum| (sum / weight) as f32).collect()
     }
 
-    /// Returns the attributes of `track` that deviate by at most `bound` from their mean. An attribute with NaN is not
-    /// steady.
+    /// Returns the attributes of track `track` (Gaussian followed through frames) whose root mean square deviation from
+    /// their mean is at most `bound`. Attributes with NaN are not among them.
     fn steady(&self, track: usize, bound: Bound) -> Attributes {
         let [frames, weight, squares] = self.opacity[track];
         let width = self.values.len() / self.opacity.len();

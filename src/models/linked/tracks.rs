@@ -43,7 +43,8 @@ pub(super) struct TrackPosition {
 pub(super) struct LinkedTracks {
     frames: PlyFrames,
     count: usize,
-    /// Number of linked tracks that may continue in the next frame: the maximum over all frames.
+    /// Number of tracks (Gaussians followed through frames) that may continue in the next frame: the maximum over all
+    /// frames, before tracks are joined.
     live_tracks: usize,
     /// For each linked track the index of the joined track to which it belongs; `None` if no tracks are joined.
     joined: Option<Vec<u32>>,
@@ -61,7 +62,7 @@ pub(super) struct LinkedTracks {
 pub(super) struct TrackLengths {
     /// Number of frames in which each track is present, by index of the track.
     frames_per_track: Vec<u32>,
-    /// Frames in which some track has several Gaussians, which are blended into one.
+    /// Numbers of the frames in which at least one joined track has several Gaussians, which are blended into one.
     pub(super) blended: Vec<u32>,
 }
 
@@ -74,7 +75,7 @@ impl TrackLengths {
     }
 }
 
-/// Counts from linking Gaussians into tracks, which are reported in notes.
+/// Counts from linking Gaussians into tracks (Gaussians followed through frames), for notes to the user.
 pub(super) struct LinkingResult {
     /// Number of Gaussians in all frames together.
     states: u64,
@@ -85,7 +86,8 @@ pub(super) struct LinkingResult {
 }
 
 impl LinkingResult {
-    /// Returns notes for the user about the linking and about the resulting `tracks`.
+    /// Returns notes for the user about the linking of Gaussians across frames, and about the resulting `tracks`
+    /// (Gaussians followed through frames).
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -115,8 +117,9 @@ impl LinkingResult {
 }
 
 impl LinkedTracks {
-    /// Links the Gaussians of `frames`, which messages call `name`, into tracks. Shows each frame to `joiner`, which
-    /// looks for tracks of the same Gaussian. Returns the tracks, counts for notes, and the linker.
+    /// Links the Gaussians of `frames`, which messages call `name`, into tracks (Gaussians followed through frames).
+    /// Shows each frame to `joiner`, which looks for different tracks of the same Gaussian. Returns the tracks, counts
+    /// for notes to the user, and the linker.
     ///
     /// # Errors
     /// Fails if a frame cannot be read, if linking needs more memory than `options` allow, or if a write fails.
@@ -184,12 +187,14 @@ impl LinkedTracks {
         (self.joined, self.count) = (Some(joined_tracks), count);
     }
 
-    /// Sets the attributes that are constant along tracks; `None` makes all attributes vary.
+    /// Sets which attributes are constant along tracks (Gaussians followed through frames), and their values. `None`
+    /// makes all attributes vary.
     pub(super) fn set_steady(&mut self, steady: Option<Steady>) {
         self.steady = steady;
     }
 
-    /// Returns the attributes that are constant along tracks, with their values; `None` if there are none.
+    /// Returns the attributes that are constant along tracks (Gaussians followed through frames), with their values;
+    /// `None` if there are none.
     pub(super) fn steady(&self) -> Option<&Steady> {
         self.steady.as_ref()
     }
@@ -221,7 +226,8 @@ impl LinkedTracks {
         Ok(lengths)
     }
 
-    /// Returns for each Gaussian of a frame the index of its track, in the order of the Gaussians in the file.
+    /// Returns for each Gaussian of frame `frame` the index of its track (Gaussian followed through frames), in the
+    /// order of the Gaussians in the file.
     fn tracks_in_frame(&self, frame: usize) -> Result<Vec<u32>> {
         let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
         self.track_of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
@@ -249,7 +255,7 @@ impl LinkedTracks {
         }
     }
 
-    /// Returns the counts of Gaussians and tracks from which memory is estimated.
+    /// Returns the counts of Gaussians and tracks (Gaussians followed through frames) from which memory is estimated.
     pub(super) fn sizes(&self) -> Sizes {
         Sizes {
             frame_gaussians: self.frames.gaussian_counts().iter().copied().max().unwrap_or(0).into(),
@@ -270,7 +276,8 @@ impl LinkedTracks {
         self.count
     }
 
-    /// Returns the rows of the Gaussians of frame `frame` that belong to tracks in the range `tracks`, sorted by track.
+    /// Returns the Gaussians of frame `frame` whose tracks (Gaussians followed through frames) have an index in
+    /// `tracks`: the track and the row in the file of the frame, sorted by track.
     pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<TrackedRow>> {
         let rows = self.tracks_in_frame(frame)?.into_iter().enumerate();
         let rows = rows.map(|(row, track)| TrackedRow { track, row: row as u32 });
@@ -279,9 +286,9 @@ impl LinkedTracks {
         Ok(rows)
     }
 
-    /// Reads the Gaussians in `rows`, which are sorted by track, from `file`, the file of a frame, into `state`. If a
-    /// track has several Gaussians, they are blended into the first of them. Returns for each track the index in `rows`
-    /// of its first row.
+    /// Reads the Gaussians `rows`, which are sorted by track, from `file`, the file of a frame. Row i of `state`
+    /// receives the Gaussian `rows[i]`. If a track (Gaussian followed through frames) has several Gaussians in the
+    /// frame, they are blended into the first of these rows. Returns for each track the index of its first row.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -300,8 +307,9 @@ impl LinkedTracks {
         Ok(firsts)
     }
 
-    /// Returns the state of each track of `rows`, which are sorted by track, in the frame stored in `file`. Gaussians
-    /// of one track are blended, and constant attributes are set to their means.
+    /// Returns the state that each track (Gaussian followed through frames) of `rows` has in the frame stored in
+    /// `file`. `rows` are sorted by track. Gaussians of one track are blended, and constant attributes are set to their
+    /// means.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -316,8 +324,9 @@ impl LinkedTracks {
         Ok(states)
     }
 
-    /// Writes the states of all tracks at all frames to the container `path`. Tracks that begin together are neighbors,
-    /// so that no bytes are written for a block of tracks that has not begun yet or has ended.
+    /// Writes the states of all tracks (Gaussians followed through frames) at all frames to the container `path`.
+    /// Tracks that begin in the same frame are neighbors. If no track of a block is present in successive frame blocks
+    /// (all have ended or not begun yet), the block is encoded only once for these frame blocks.
     pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
@@ -358,7 +367,8 @@ impl LinkedTracks {
     }
 }
 
-/// Source from which the container is written: the states of all tracks at the frames of one block.
+/// States of all tracks (Gaussians followed through frames) at the frames of one frame block, from which the container
+/// is written.
 struct FrameBlock<'a> {
     info: SequenceInfo,
     tracks: &'a LinkedTracks,
@@ -367,8 +377,9 @@ struct FrameBlock<'a> {
     files: &'a [Ply],
     /// For each frame of the block the rows of its Gaussians, sorted by track.
     rows: &'a [Vec<TrackedRow>],
-    /// For each track the frame and row of its last Gaussian before this block. For a track that begins later: the
-    /// frame and row of its first Gaussian.
+    /// For each track the frame and row of the Gaussian that gives its state just before this frame block: the last
+    /// Gaussian of the track before the block. If there is none, because the track begins in the block or after it: the
+    /// first Gaussian of the track.
     held: &'a [TrackPosition],
 }
 
@@ -391,7 +402,7 @@ impl FrameSource for FrameBlock<'_> {
 
 impl FrameBlock<'_> {
     /// Writes to `state` the states that the tracks of `range` (Gaussians followed through frames) have just before the
-    /// first frame of this block of frames. A track that has not begun yet gets the state at its beginning.
+    /// first frame of this block of frames. A track that begins in this block or after it gets its first state.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
         let mut by_frame: Vec<(TrackPosition, usize)> =
             self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
@@ -415,7 +426,7 @@ impl FrameBlock<'_> {
     }
 }
 
-/// Reader of the states of consecutive tracks, frame by frame.
+/// Reader of the states of consecutive tracks (Gaussians followed through frames), frame by frame.
 struct TrackReader<'a> {
     block: &'a FrameBlock<'a>,
     range: Range<usize>,
@@ -428,8 +439,8 @@ struct TrackReader<'a> {
 }
 
 impl TrackReader<'_> {
-    /// Resets the reader to the beginning of its block of frames: sets `state` to the states of the tracks just before
-    /// the first frame of the block.
+    /// Resets the reader to the beginning of its block of frames: sets `state` to the states that its tracks (Gaussians
+    /// followed through frames) have just before the first frame of the block.
     fn begin(&mut self) -> Result<()> {
         self.block.hold(self.range.clone(), &mut self.state)?;
         if let Some(means) = &self.means {

@@ -16,13 +16,17 @@ use crate::models::trajectories::merged;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 
-/// Row number of a track that is absent from a frame.
+/// Row number of a track (Gaussian followed through frames) that is absent from a frame.
 const NO_ROW: u32 = u32::MAX;
 
 impl LinkedFrames {
-    /// Writes one file per frame into `folder`. A proxy (Gaussian that replaces merged tracks) is present in a frame if
-    /// one of its members is present, and takes the row of the first such member. Several Gaussians of a track become
-    /// one, in the row of the first. Attributes that are constant along a track have their mean values.
+    /// Writes one PLY file per frame of the compressed model `reduction` into `folder`. Each Gaussian takes a row of
+    /// the input file of the frame:
+    /// - A track (Gaussian followed through frames) keeps its row. If it has several Gaussians in the frame, they
+    ///   become one, in the row of the first. Attributes that are constant along the track have their mean values.
+    /// - A proxy (Gaussian that replaces merged tracks) takes the row of its leader (most important member), or, if the
+    ///   leader is absent from the frame, of the first member that is present. If no member is present, the proxy is
+    ///   absent too.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.

@@ -1,5 +1,5 @@
 //! Computes proxies (Gaussians that replace merged ones) that have stored parameters of a model format, and compares
-//! them with the moment match of their members.
+//! them with the moment match of the merged Gaussians (the Gaussian with the mean and covariance of their mixture).
 
 use super::{MotionModel, MotionModelFrames};
 use crate::compressed_model::{Cluster, Proxies, ReferenceFrame};
@@ -15,10 +15,12 @@ use crate::source::FrameSource;
 /// match of its members (the Gaussian with the mean and covariance of the merged Gaussians).
 const MAX_OPACITY_DIFFERENCE: f64 = 0.1;
 
-/// Returns the proxies (Gaussians that replace merged ones) that `propose` computes for `clusters`, one row each. A
-/// proxy is refused if at any frame its state differs by more than `max_drift` in position or 0.1 in opacity from the
-/// moment match of its members (the Gaussian with the mean and covariance of their mixture). Frames in which both are
-/// invisible are not compared.
+/// Computes a proxy (Gaussian that replaces merged ones) for each of `clusters`, and refuses those that do not move
+/// like their members. `propose` returns the stored parameters of the proxies, one row per cluster. At every frame, a
+/// proxy is compared with the moment match of its members (the Gaussian with the mean and covariance of their mixture);
+/// frames in which both are invisible are skipped. A proxy is refused if at any frame they differ by
+/// - more than `max_drift` in position (if it is relative, it refers to the extent of `reference`), or
+/// - more than 0.1 in opacity.
 ///
 /// # Errors
 /// Fails if `propose` fails or frames cannot be evaluated.

@@ -108,8 +108,9 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
     }
 }
 
-/// Returns the SH degree and the number of stored time-dependent SH terms for a number of SH coefficients per channel;
-/// `None` if no model has this number.
+/// Returns the SH degree and the number of stored time-dependent SH terms of a model that stores `coefficients` SH
+/// coefficients per channel; `None` if no model has this number. `is_4d` states that it is a 4D model, not a static
+/// one.
 fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
     match (coefficients, is_4d) {
         (1 | 4 | 9 | 16, _) => Some((coefficients.isqrt() - 1, 0)),
@@ -120,8 +121,9 @@ fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
     }
 }
 
-/// Returns the motion model of a 4D model. `parts` are the values of its capture tuple, the training state in the
-/// checkpoint. At most `stored_terms` time-dependent SH terms are in use.
+/// Creates the motion model of a 4D model from the values `parts` of its capture tuple, the training state in the
+/// checkpoint. `stored_terms` is the number of time-dependent SH terms that the model stores; at most so many are used.
+/// Fails if a value has the wrong type.
 fn motion_model(
     checkpoint: &Checkpoint,
     parts: &[NodeId],

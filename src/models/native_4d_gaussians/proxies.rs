@@ -1,10 +1,13 @@
-//! Computes proxies (Gaussians that replace merged ones) of four-dimensional Gaussians. The matched slice (state at one
-//! time) and temporal window are combined into one 4D Gaussian.
+//! Computes proxies (Gaussians that replace merged ones) of four-dimensional Gaussians.
 //!
-//! The match of the slices is a line with velocity v, a spatial covariance Σ, and a window of standard deviation s in
-//! time. Then Σ₄ = [[Σ + vvᵀs², vs²], [vᵀs², s²]], whose axes give two quaternions. SH coefficients refer to the
-//! proxy's own center in time: the values of the moment match at the sampled frames are fitted by 1, a cosine wave and
-//! the wave of twice its frequency (least squares, with a ridge term on the waves).
+//! [`match_proxies`] computes for each proxy a straight path with velocity v, a spatial covariance Σ, and a temporal
+//! window of standard deviation s. They are combined into one 4D Gaussian with the covariance Σ₄ = [[Σ + vvᵀs², vs²],
+//! [vᵀs², s²]], whose axes give two quaternions.
+//!
+//! SH coefficients refer to the proxy's own center in time. They are fitted to the SH coefficients of the moment
+//! matches at the sampled frames (a moment match is the Gaussian with the mean and covariance of the merged Gaussians).
+//! The fit is by the functions 1, a cosine wave and the wave of twice its frequency (least squares, with a ridge term
+//! on the waves).
 
 use super::frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
@@ -15,8 +18,9 @@ use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 
-/// Ridge term of the fit of a proxy's colors along time, as a fraction of the total weight of the frames. It keeps the
-/// coefficients of the cosine terms near 0 if the frames do not distinguish these terms from the constant term.
+/// Ridge term of the fit of the colors of a proxy (Gaussian that replaces a merged cluster) along time, as a fraction
+/// of the total weight of the frames. It keeps the coefficients of the cosine terms near 0 if the frames do not
+/// distinguish these terms from the constant term.
 const RIDGE: f64 = 1e-3;
 
 /// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`, one row
@@ -110,8 +114,9 @@ impl ThreeFunctionFit {
         }
     }
 
-    /// Returns, for each fitted value (one SH coefficient of one color channel over time), the least-squares
-    /// coefficients of the constant and of the first `terms` cosine waves; the other coefficients are 0.
+    /// Returns for each fitted value (one SH coefficient of one color channel over time) its three least-squares
+    /// coefficients: of the constant, the first and the second cosine wave. Only the first `terms` waves are fitted;
+    /// the coefficients of the others are 0.
     fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
         let mut normal = self.normal;
         let ridge = RIDGE * normal[0][0];

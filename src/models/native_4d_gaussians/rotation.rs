@@ -1,8 +1,9 @@
 //! Four-dimensional rotations, given as pairs of quaternions.
 //!
 //! The rotation matrix is R = L(l)·R̄(r), for vectors (w, x, y, z). L multiplies from the left by the unit quaternion
-//! l, and R̄ from the right by the conjugate of the unit quaternion r. After the order of rows and columns is reversed,
-//! they stand for x, y, z, t. Source: `build_rotation_4d` of the repository.
+//! l, and R̄ from the right by the conjugate of the unit quaternion r. If the order of the rows and of the columns of R
+//! is then reversed, they belong to the axes x, y, z and t of space and time, in this order. Source:
+//! `build_rotation_4d` of the repository fudan-zvg/4d-gaussian-splatting on GitHub.
 
 /// 4×4 matrix, row by row.
 pub(super) type Matrix = [[f64; 4]; 4];

@@ -313,7 +313,7 @@ fn captures_without_an_optimizer_are_read_and_written() {
     assert_eq!(states(&*left), expected.iter().map(|state| state.pick(&[1, 4])).collect::<Vec<_>>());
 }
 
-/// Values in half precision, each row stored after an unused one.
+/// Checks tensors in half precision, and a tensor whose rows are each stored after an unused row.
 #[test]
 fn half_precision_and_strides_in_captures_are_read() {
     let folder = CheckpointFolder::new();

@@ -61,7 +61,7 @@ struct CachedNodes {
     nodes: Nodes,
     /// Canonical positions of the nodes, encoded as input of the network.
     encoded: EncodedPositions,
-    /// Whether the last feature of a Gaussian is its motion mask.
+    /// Whether the last feature of a Gaussian is its motion mask (logit of a factor on its motion).
     has_mask: bool,
     /// Network outputs for all nodes at the last requested times, oldest first. The key is the f32 bits of the time.
     cache: Mutex<VecDeque<(u32, Arc<PredictedMotion>)>>,
@@ -69,7 +69,8 @@ struct CachedNodes {
 
 /// Values of a block of Gaussians that do not depend on time.
 enum PreparedNodes {
-    /// For each Gaussian the K nodes that move it: index of the node, and its weight multiplied by the motion mask.
+    /// For each Gaussian the K nodes that move it: index of the node, and its weight multiplied by the motion mask
+    /// (factor from 0 to 1 on the motion of the Gaussian).
     Shares(Vec<(u32, f64)>),
     /// Positions encoded as input of the network, for a model without nodes.
     Encoded(EncodedPositions),
@@ -166,8 +167,8 @@ impl NodeMotion {
 }
 
 impl CachedNodes {
-    /// Returns the motion mask of the Gaussian in row `row`: σ (logistic function) of its last feature; 1 without a
-    /// mask.
+    /// Returns the motion mask (factor on the motion) of the Gaussian in row `row`: σ (logistic function) of its last
+    /// feature; 1 without a mask.
     fn mask(&self, raw: &StoredParams, row: usize) -> f64 {
         if self.has_mask { opacity(raw.format_specific.plane(self.nodes.features())[row]) } else { 1.0 }
     }
@@ -199,8 +200,8 @@ impl CachedNodes {
     }
 }
 
-/// Returns for each Gaussian the network's outputs for the nodes that move it, summed with the weights of the nodes.
-/// `output` has one row per node. `shares` holds node indices and weights, `each` of them per Gaussian.
+/// Returns for each Gaussian the weighted sum of the network's outputs for the nodes that move it. `output` has one row
+/// per node. `shares` holds (node index, weight) pairs, Gaussian by Gaussian; each Gaussian has `each` pairs.
 fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> AttributeValues {
     let mut out = AttributeValues::zeros(output.width(), shares.len() / each.max(1));
     for c in 0..output.width() {
@@ -338,8 +339,8 @@ fn add(by: &AttributeValues, to: &mut AttributeValues) {
     each(by, to, |value, by| value + by);
 }
 
-/// Replaces each value of `to` by `f` of this value and the value of `by` at the same place. Components that `by` lacks
-/// stay unchanged.
+/// Replaces each value v of `to` by `f(v, b)`, where b is the value of `by` for the same component and Gaussian.
+/// Components that `by` lacks stay unchanged.
 #[inline(always)]
 fn each(by: &AttributeValues, to: &mut AttributeValues, f: impl Fn(f32, f32) -> f32) {
     for c in 0..by.width().min(to.width()) {
@@ -347,14 +348,14 @@ fn each(by: &AttributeValues, to: &mut AttributeValues, f: impl Fn(f32, f32) -> 
     }
 }
 
-/// Returns the logit of an opacity after adding `by` to the opacity; `stored` is its logit before.
+/// Adds `by` to an opacity and returns the logit of the result. `stored` is the logit of the opacity before.
 fn add_to_opacity(stored: f32, by: f32) -> f64 {
     let alpha = opacity(stored) + f64::from(by);
     logit(alpha.clamp(0.0, 1.0)).clamp(-MAX_LOGIT, MAX_LOGIT)
 }
 
 /// Returns the derivatives of the positions at `time` with respect to the stored positions, for Gaussians that follow
-/// nodes. They include that the node weights depend on the position.
+/// nodes. They include the change of the node weights with the position.
 fn position_slopes(sparse: &CachedNodes, network: &Network, raw: &StoredParams, time: f64) -> Result<AttributeValues> {
     let motion = sparse.motion(network, time)?;
     let (mut out, mut shares) = (AttributeValues::zeros(9, raw.len()), Vec::new());

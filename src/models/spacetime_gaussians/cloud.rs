@@ -194,9 +194,9 @@ fn own_property_names(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Replaces the colors in `raw` by SH coefficients of degree 0. With `activation`, a color is `activation` applied to
-/// the first three features of a Gaussian. Without it, `raw` holds stored colors in place of SH coefficients, and these
-/// are converted.
+/// Sets the colors in `raw` as SH coefficients of degree 0. There are two cases:
+/// - Full model (`activation` given): a color is `activation` applied to the first three features of the Gaussian.
+/// - Lite model (`None`): `raw` holds the stored colors in place of SH coefficients, and they are converted.
 fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
         let features = raw.format_specific.width() > FEATURES;

@@ -28,8 +28,8 @@ pub(super) fn residence(width: usize) -> MemoryProfile {
     }
 }
 
-/// Checks that the model can be written as `kind`. The caller handles the kinds of output that store the model's own
-/// parameters. `is_full` states that it is a full model, not a lite one.
+/// Fails if a SpacetimeGaussians model cannot be written as the kind of output `kind`: a full model (`is_full`) not as
+/// `.splatv`, which stores no features. The caller checks model folders and single PLY files.
 pub(super) fn check_kind(kind: OutputKind, is_full: bool) -> Result<()> {
     match kind {
         OutputKind::Splatv if is_full => Err(Error::usage(

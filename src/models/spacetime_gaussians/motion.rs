@@ -77,8 +77,8 @@ pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Returns the center and the log width of the merged temporal window, which has the same first and second moments in
-/// time as the weighted sum of the windows of `members`. Each member is a weight and a motion.
+/// Returns the center and the log width of the temporal window into which the windows of `members` are merged. It has
+/// the same first and second moments in time as their weighted sum. Each member is a weight and a motion.
 pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     // Each window counts with its area in time, relative to the widest one, so that no area overflows.
     let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));

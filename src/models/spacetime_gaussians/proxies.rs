@@ -4,7 +4,8 @@
 //! is exact. The weighted mean of their coefficients then gives the weighted mean of their states at every time. If
 //! their windows differ, so that different members are visible at different times, the path is a least-squares fit to
 //! the weighted mean of the visible members. Size and shape are second moments over the window, in axes that rotate
-//! with the proxy. The opacity is the amplitude of the window that best fits the opacity of the members' moment match.
+//! with the proxy. The opacity is the amplitude of the window that best fits the opacity of the members' moment match
+//! (the Gaussian with the mean and covariance of their mixture).
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -66,7 +67,7 @@ struct ClusterMembers<'a> {
 }
 
 impl ClusterMembers<'_> {
-    /// Collects the members of `cluster` from `model`.
+    /// Collects the members of `cluster` (Gaussians to be merged) from `model`.
     fn new<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
         let ids: Vec<u32> = cluster.members.iter().map(|&(id, _)| id).collect();
         let raw = model.raw().pick(&ids);
@@ -77,7 +78,7 @@ impl ClusterMembers<'_> {
         ClusterMembers { prepared: model.motion_model().prepare(&raw), model, raw, motions, rows, leader }
     }
 
-    /// Returns the states of all members at `time`, one row per member.
+    /// Returns the states of all members (Gaussians to be merged) at `time`, one row per member.
     fn state(&self, time: f64) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(self.raw.len(), self.raw.gaussians.sh_degree());
         self.model.motion_model().state(time, &self.raw, &self.prepared, Attributes::all(), &mut state)?;
@@ -146,8 +147,8 @@ fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
     base + members.rows.iter().map(|&(row, weight)| weight * (f64::from(plane[row as usize]) - base)).sum::<f64>()
 }
 
-/// Returns whether the temporal windows of `members` differ so much from that of `proxy` that different members are
-/// visible at different times. Each member is a weight and a motion.
+/// Returns whether the temporal windows of `members` differ so much from that of `proxy`, the motion of the Gaussian
+/// that replaces them, that different members are visible at different times. Each member is a weight and a motion.
 fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
         let wider = (member.log_width - proxy.log_width).abs() > MAX_WIDTH_RATIO.ln();
@@ -155,10 +156,10 @@ fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -
     })
 }
 
-/// Returns the states that the proxy (Gaussian that replaces `members`) should approximate at the frames: the means of
-/// the members, weighted by their temporal windows. `recentered` holds the weights of the members and their motions
-/// around the center of the proxy. Quaternions have the sign that brings them nearest to the quaternion of the motion
-/// `mean`.
+/// Returns the states that a proxy (Gaussian that replaces `members`) should approximate, one per frame. A state is the
+/// mean of the members' states, weighted by their weights in the proxy times the values of their temporal windows.
+/// `recentered` holds for each member its weight, and its motion expressed around the center of the proxy. Each
+/// quaternion gets the sign that brings it nearest to the quaternion of the motion `mean`.
 fn target_states(
     members: &ClusterMembers<'_>,
     recentered: &[(f64, SpacetimeMotion)],
@@ -220,9 +221,10 @@ fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
     if found.is_finite() { found } else { DQuat::IDENTITY }
 }
 
-/// Returns the logit of the proxy's opacity at the center of its temporal window: the amplitude of the window, fitted
-/// by least squares. The window is fitted to the opacities at `times` of the moment match of the members (the Gaussian
-/// with the mean and covariance of their mixture). `states` holds the states of the members at each of `times`.
+/// Returns the logit of the opacity of the proxy (Gaussian that replaces `members`) at the center of its temporal
+/// window. This opacity is the factor with which the window of `motion` best fits (least squares) the opacity of the
+/// members' moment match (the Gaussian with the mean and covariance of their mixture) at `times`. `states` holds the
+/// states of the members at each of `times`.
 fn amplitude(
     members: &ClusterMembers<'_>,
     states: &[Gaussians],

@@ -231,7 +231,8 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
     }
 }
 
-/// Returns a compressed model of three Gaussians: one is a proxy, two have parameter deltas.
+/// Returns a compressed model of three Gaussians: one is a proxy (it replaces two merged Gaussians), and each has a
+/// parameter delta (change that refinement adds to its parameters).
 fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = MergeParams { max_drift: 1e6, ..Recipe::preset("default").unwrap().merge };
     let cluster = Cluster { output: 1, leader: 3, members: vec![(2, 0.25), (3, 0.75)] };

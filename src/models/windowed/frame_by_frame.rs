@@ -24,8 +24,9 @@ pub(super) struct FrameByFrame {
 }
 
 impl FrameByFrame {
-    /// Creates the motion model of `frames` frames with evenly spaced times. If `clip` is the range from 0 to 1, frame
-    /// i of n is at the time i/n; else the first and the last frame are at the first and the last time of `clip`.
+    /// Creates the motion model of `frames` frames with evenly spaced times.
+    /// - If `clip` is the range from 0 to 1, frame i of n has the time i/n.
+    /// - Otherwise the first and the last frame have the first and the last time of `clip`.
     pub(super) fn new(frames: usize, clip: ClipTimes) -> FrameByFrame {
         let is_mapped = (clip.first, clip.last) != (0.0, 1.0);
         // Frames of a converted sequence reach its last time. Without it, frame i of n begins at i/n.

@@ -40,9 +40,9 @@ const NAME: &str = "archive";
 /// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
 /// coarser step would round nearly all values to the same number.
 const MAX_STEP: f64 = 4.0;
-/// Minimum standard deviation that is assumed when the quantization step of an additional column of the Gaussians is
-/// chosen, as a fraction of the largest magnitude in the column. With it, a column of equal values keeps about the
-/// precision of f32.
+/// Lower bound of the standard deviation from which the quantization step of an additional column is derived (values of
+/// the Gaussians beside the standard attributes). Unit: largest magnitude in the column. A column of equal values then
+/// keeps about the precision of f32.
 const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 /// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
 /// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this
@@ -106,8 +106,8 @@ impl ValueGroup {
         }
     }
 
-    /// Returns how many initial quantization steps make up one standard deviation of the values of this group. Initial
-    /// steps are finer than most final ones.
+    /// Returns how many quantization steps make up one standard deviation of the values of this group before the steps
+    /// are adapted to the quality of renders. These initial steps are finer than most final ones.
     fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
@@ -152,7 +152,8 @@ impl ArchiveStage {
     ///
     /// # Errors
     /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, if the
-    /// required PSNR is missed by far, or if even the coarsest archive of these Gaussians exceeds the byte limit.
+    /// required PSNR is missed by far (`check_met`), or if even the coarsest archive of these Gaussians exceeds the
+    /// byte limit.
     pub fn archive(
         &self,
         scene: &Scene,
@@ -276,8 +277,9 @@ struct Grids {
     deviations: Vec<f64>,
     /// Log2 of the quantization step of each group (attribute, column or tensor) in `groups`.
     octaves: Vec<f64>,
-    /// For each tensor, by name: offsets, in eighths of an octave, by which the steps of its channels (or of its rows
-    /// and columns) differ from the step of the tensor. See [`TensorSteps::channels`].
+    /// For each tensor, by name: numbers that are added to the log2 of its quantization step, in eighths of an octave
+    /// (doubling). A feature plane has one per channel; a matrix one per row, then one per column; any other tensor one
+    /// per element. Empty if all are 0. See [`TensorSteps::channels`].
     offsets: BTreeMap<String, Vec<i8>>,
 }
 

@@ -1,4 +1,5 @@
-//! Stage `bands`: drops SH degrees of the result, from the highest down, as long as renders hardly change.
+//! Stage `bands`: drops SH degrees of the result, from the highest down, as long as the error that this adds to renders
+//! is small against the error that the result has already ([`ShDegreeStage::margin`]).
 //!
 //! Memory: one state of the original, two of the result (a state holds all Gaussians at one frame), and three rendered
 //! views.
@@ -26,12 +27,15 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "bands";
 
-/// Name under which the journal records that no SH degree was dropped, in its list of the work that the run omitted.
+/// Name of the work "lowering the SH degree" in the journal (record of the run for the user). Used in its list of
+/// omitted work, if the result keeps its full SH degree.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
-/// Returns the SH degree of a result of `scene` if the user asks for at most `degree`. This is `degree`, or the degree
-/// of the input if that is lower or if the format of the input needs all degrees. If a lower degree than that of the
-/// input is asked for, adds a note to the journal: that coefficients are dropped, or why they stay.
+/// Returns the SH degree of a result of `scene` if the user asks for at most `degree`:
+/// - if the degree of the input is not higher than `degree`: the degree of the input;
+/// - if the format of the input needs all degrees: the degree of the input, and the journal (record of the run) gets
+///   the reason;
+/// - otherwise: `degree`, and the journal gets a note that higher coefficients are dropped.
 pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
     let all = scene.source().info().sh_degree;
     match scene.input.needs_all_bands() {
@@ -50,8 +54,8 @@ pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> us
 /// Stage that lowers the SH degree of a result if renders hardly change.
 #[derive(Debug, Clone)]
 pub(crate) struct ShDegreeStage {
-    /// Required margin, dB. The PSNR between renders with the lower degree and with all degrees must exceed, by this
-    /// margin, the PSNR between the result and the original.
+    /// Minimum difference of two PSNRs, dB, with which a degree is dropped: the PSNR between renders with the lower
+    /// degree and with all degrees, minus the PSNR between the result and the original.
     pub margin: f64,
 }
 
@@ -122,8 +126,8 @@ impl ShDegreeStage {
         }
     }
 
-    /// Returns `compressed` with the lowest SH degree at which renders change no more than the margin allows. Adds the
-    /// measured PSNRs, and the reason if no degree is dropped, to the journal.
+    /// Returns `compressed` with the lowest SH degree that the margin allows ([`ShDegreeStage::margin`]). Adds the
+    /// measured PSNRs, and the reason if no degree is dropped, to `journal`, the log of the run.
     ///
     /// # Errors
     /// Fails if frames cannot be read.

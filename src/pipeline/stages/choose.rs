@@ -24,18 +24,20 @@ use crate::scene::Scene;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "choose";
 
-/// Number of views, chosen among those used for scoring, on which the merged and the pruned model are compared. The
-/// mean PSNR over these views differs from that over all views by less than the PSNRs of the two models usually differ.
+/// Number of views on which the merged and the pruned model are compared; they are chosen among the views used for
+/// scoring. The mean PSNR over these few views differs from the mean over all views by less than the two models usually
+/// differ from each other.
 const COMPARED_VIEWS: usize = 24;
 
 /// Number of views of one frame that are rendered at the same time.
 const VIEWS_PER_BATCH: usize = 4;
 
-/// Bytes of memory per Gaussian for the merged clusters, which are in memory twice during the comparison, and for
-/// reading their members.
+/// Bytes of memory per Gaussian that the stage takes for the merged clusters: two copies of the clusters, and the
+/// reader of their members.
 pub(crate) const BYTES_PER_GAUSSIAN: u64 = 125;
 
-/// Stage that chooses between merging and pruning alone.
+/// Stage that keeps either the merged model or a model that is only pruned: the one whose renders are closer to the
+/// original.
 #[derive(Debug, Clone)]
 pub(crate) struct Choose {
     /// Whether the user requested an exact number of Gaussians.
@@ -102,14 +104,14 @@ impl Choose {
     }
 
     /// Compares the model `merged` with the same number of unmerged Gaussians from the top of the ranking, by mean PSNR
-    /// against the original on views used for scoring.
+    /// against the original on views used for scoring. Returns a model that depends on the comparison:
     ///
-    /// - If `merged` has the higher PSNR, returns it.
-    /// - Otherwise, if an exact number of Gaussians was requested, returns the unmerged model.
-    /// - Otherwise returns an unmerged model with as many Gaussians from the top of the ranking as the selection by
-    ///   scores keeps.
+    /// - if `merged` has the higher PSNR: `merged`;
+    /// - if it has not, and an exact number of Gaussians was requested: the unmerged model;
+    /// - if it has not, and no number was requested: an unmerged model with as many Gaussians from the top of the
+    ///   ranking as the selection by scores keeps.
     ///
-    /// Records merging that is discarded in the journal.
+    /// If merging is discarded, records this in `journal`, the log of the run.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -179,14 +181,14 @@ mod tests {
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
 
-    /// Returns the mean PSNR of `compressed` against the original, dB, over the views on which this stage compares
-    /// models.
+    /// Returns the mean PSNR, dB, of renders of `compressed` against renders of the original, over the views on which
+    /// the stage `choose` compares models.
     fn quality(scene: &Scene, compressed: &CompressedModel) -> f64 {
         mean_psnr(scene, &[], compressed, &select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME)).unwrap()[1]
     }
 
-    /// Merges the Gaussians of a scene down to `target`, if given, and runs the stage `choose` on the merged model.
-    /// Returns the merged model, the model that the stage chose, and the journal.
+    /// Merges the Gaussians of a scene (down to `target` Gaussians, if given). The stage `choose` then takes either
+    /// this model or a pruned one. Returns the merged model, the model that the stage took, and the journal.
     fn chosen(
         scene: &Scene,
         scored: &Scored,

@@ -1,5 +1,5 @@
-//! Stage `field`: stores the deformation field of the result in half precision (16-bit floats) if this hardly changes
-//! renders.
+//! Stage `field`: stores the deformation field of the result in half precision (16-bit floats) if the error that this
+//! adds to renders is small against the error that the result has already ([`FieldPrecisionStage::margin`]).
 //!
 //! Memory: two states (all Gaussians at one frame), and two rendered views.
 
@@ -32,8 +32,8 @@ pub(crate) const COMPARED_VIEWS: usize = 12;
 /// Stage that chooses the precision in which the deformation field of a result is written.
 #[derive(Debug, Clone)]
 pub(crate) struct FieldPrecisionStage {
-    /// Required margin, dB. The PSNR between renders with the half-precision field and with the exact field must
-    /// exceed, by this margin, the PSNR between the result and the original.
+    /// Minimum difference of two PSNRs, dB, with which half precision is used: the PSNR between renders with the
+    /// half-precision field and with the exact field, minus the PSNR between the result and the original.
     pub margin: f64,
 }
 
@@ -100,9 +100,9 @@ impl FieldPrecisionStage {
         }
     }
 
-    /// Returns `compressed` with its deformation field in half precision, if the input supports it and renders change
-    /// no more than the margin allows. Otherwise returns `compressed` unchanged. Adds the measured PSNRs, and the
-    /// reason if the field stays exact, to the journal.
+    /// Returns `compressed` with its deformation field in half precision, if the input supports it and the margin
+    /// ([`FieldPrecisionStage::margin`]) allows it; otherwise returns `compressed` unchanged. Adds the measured PSNRs,
+    /// and the reason if the field stays exact, to `journal`, the log of the run.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -136,8 +136,9 @@ impl FieldPrecisionStage {
     }
 }
 
-/// Returns the minimum PSNR, dB, that renders of a coarser version of a result must have against renders of the result:
-/// `result` + `margin`, but at most [`MAX_USEFUL_PSNR`]. `result`: PSNR of the result against the original, dB.
+/// Returns the minimum PSNR, dB, that renders after an optional reduction (half precision, fewer SH degrees) must have
+/// against renders of the same model before it: `result` + `margin`, but at most [`MAX_USEFUL_PSNR`]. `result`: PSNR of
+/// the model before the reduction against the original, dB.
 pub(crate) fn min_psnr(result: f64, margin: f64) -> f64 {
     MAX_USEFUL_PSNR.min(result + margin)
 }

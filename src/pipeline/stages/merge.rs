@@ -51,12 +51,14 @@ pub(crate) const PAIRS: &str = "pairs";
 /// divided stage).
 const MIN_DIVIDED_PAIRS: usize = 20_000;
 
-/// Bytes of memory per Gaussian that may survive. They hold its id in the list of all such Gaussians and in the subset
-/// on which merging is tried, its state with base colors only, a flag whether the state is finite, and its merge class.
+/// Bytes of memory of the stage for each Gaussian that may survive. The terms are, in order: its id in two lists (all
+/// such Gaussians, and the set that is being merged), its state with base colors only, and a flag whether its state is
+/// finite together with its merge class.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
-/// Assumed number of sets of survivors (Gaussians left by pruning) on which merging is tried until it leaves the
-/// requested number of Gaussians; used to estimate reads. The secant search ([`bracket`]) usually needs fewer.
+/// Assumed number of times that the stage merges, each time a different number of survivors (Gaussians left by
+/// pruning), until exactly the requested number of Gaussians is left; used to estimate reads. The secant search
+/// ([`bracket`]) usually needs fewer.
 const USUAL_TRIALS: f64 = 16.0;
 
 /// Number of Gaussians whose full states are read at a time at the reference frame. Merging then keeps only the
@@ -71,7 +73,8 @@ const FOLLOWED_FRACTION: f64 = 0.3;
 /// Stage that merges similar survivors (Gaussians that are not removed).
 #[derive(Debug, Clone)]
 pub(crate) struct MergeStage {
-    /// Parameters of the tests for similarity, of the merge passes and of the proxies.
+    /// Parameters of the tests for similarity, of the merge passes, and of the proxies (Gaussians that replace merged
+    /// clusters).
     pub recipe: recipe::MergeParams,
     /// Parameters of the scan, which define in which frames a Gaussian is alive (its life span: opacity ≥ alpha_min)
     /// and how motion between frames is measured.
@@ -92,8 +95,8 @@ pub(crate) struct MergeOutcome {
     pub summary: Option<MergeSummary>,
 }
 
-/// Adds the stage that merges survivors (Gaussians left by pruning) to `stages` if the run merges; otherwise records
-/// the reason why it does not.
+/// Adds the stage that merges survivors (Gaussians left by pruning) to `stages` if the run merges. If it does not,
+/// records the reason in `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let recipe = &planning.request.recipe;
     let stage = MergeStage {
@@ -144,7 +147,7 @@ impl Stage for MergeStage {
 
 impl MergeStage {
     /// Returns the resource estimate of the stage. Its memory holds the pairs that are measured at the same time, all
-    /// Gaussians that may survive, and the proxies.
+    /// Gaussians that may survive, and the proxies (Gaussians that replace merged clusters).
     pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
         // Only base colors are compared. There is at most one proxy for every two Gaussians, held before and after a
@@ -175,9 +178,10 @@ impl MergeStage {
         }
     }
 
-    /// Merges the first `survivors` Gaussians of the ranking, computes the parameters of the proxies, and returns the
-    /// merged model. If an exact number of Gaussians is requested and Gaussians may be pruned, merges only the first m
-    /// Gaussians of the ranking, where m is chosen so that merging leaves exactly the requested number.
+    /// Merges the first `survivors` Gaussians of the ranking, computes the parameters of the proxies (Gaussians that
+    /// replace merged clusters), and returns the merged model. If an exact number of Gaussians is requested and
+    /// Gaussians may be pruned, merges only the first m Gaussians of the ranking, where m is chosen so that merging
+    /// leaves exactly the requested number.
     ///
     /// # Errors
     /// Fails if frames cannot be read, or if merging without pruning cannot reach the requested number.
@@ -226,13 +230,14 @@ impl MergeStage {
     }
 }
 
-/// Returns about the largest number m, from `target` to `all`, such that merging m survivors (Gaussians left by
-/// pruning) leaves at most `target` Gaussians. The callback `merged` merges m survivors and returns the number of
-/// Gaussians that are left. m = `target` always satisfies the condition.
+/// Finds the number m of survivors (Gaussians left by pruning) that merging must get as input so that about `target`
+/// Gaussians are left after it. Merging replaces each cluster of similar Gaussians in its input by one Gaussian. The
+/// callback `merged` runs merging on m survivors and returns the number of Gaussians that are left.
 ///
-/// With more survivors as input, merging leaves more Gaussians, except for small dips, so the interval of possible m is
-/// narrowed by the secant method. The search ends early if the number left is below `target` by at most a thousandth of
-/// it; the caller then makes fewer joins, so that exactly `target` Gaussians are left.
+/// Returns about the largest m, from `target` to `all`, for which at most `target` Gaussians are left. For m = `target`
+/// this is always so. With more survivors as input, merging leaves more Gaussians, except for small dips, so the
+/// interval of possible m is narrowed by the secant method. The search ends early if the number left is below `target`
+/// by at most a thousandth of it; the caller then makes fewer joins, so that exactly `target` Gaussians are left.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;
@@ -364,8 +369,9 @@ impl<'a> Trial<'a> {
 
 /// Measures the similarity of motion of the two Gaussians of each pair in `pairs`. Returns the pairs with their
 /// similarities, in no particular order. The pairs hold indices in `pool`, the ids of the Gaussians in memory;
-/// `reference` holds the positions of these Gaussians at the reference frame. If there are many pairs, sorts them by
-/// position in space and divides them into shards.
+/// `reference` holds the positions of these Gaussians at the reference frame. If the cache is enabled and there are at
+/// least [`MIN_DIVIDED_PAIRS`] pairs, sorts them by position in space and divides them into shards, which several
+/// processes can measure.
 fn measure(
     work: &Cache,
     meter: &mut PairMeter<'_>,

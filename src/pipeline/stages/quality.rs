@@ -54,12 +54,13 @@ const TIMED_VIEWS: usize = 3;
 #[derive(Debug, Clone)]
 pub(crate) struct QualityStage {
     input: InputOptions,
-    /// Whether the result may have proxies, each of which is computed from several Gaussians of the input.
+    /// Whether the result may have proxies (Gaussians that replace merged clusters), each of which is computed from
+    /// several Gaussians of the input.
     merges: bool,
 }
 
-/// Adds the stage that measures the quality of the result to `stages` if the quality is to be measured; otherwise
-/// records that memory does not suffice for it.
+/// Adds the stage that measures the quality of the result to `stages` if the plan has memory for it. If it has not,
+/// records this in `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     match planning.measures_quality {
         true => {
@@ -122,9 +123,12 @@ impl QualityStage {
         }
     }
 
-    /// Measures the quality of the result of `run`. Returns `None` if the result is an archive of frames: its frames
-    /// exist only once it is written. If refinement used validation views and there are no test views, takes the PSNR
-    /// on the validation views from the journal.
+    /// Measures the quality of the result of `run` on the first of these sets of views that exists:
+    /// - test views;
+    /// - validation views of refinement, whose PSNR is taken from `journal`, the log of the run;
+    /// - training views, or views of cameras placed by the program.
+    ///
+    /// Returns `None` if the result is an archive of frames: its frames exist only once it is written.
     fn measure(&self, run: &RunState<'_>, journal: &mut Journal) -> Result<Option<QualitySummary>> {
         let scene = run.scene;
         let times = &scene.source().info().times;

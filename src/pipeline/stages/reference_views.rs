@@ -186,8 +186,8 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
     Ok(psnr)
 }
 
-/// Checks that the PSNR `found` of an archive against the result before quantization is about as high as `asked`, dB.
-/// An archive with a byte limit always passes.
+/// Checks that the PSNR `found` of an archive against the result before quantization is at most [`MAX_SHORTFALL`] below
+/// the required PSNR `asked`, dB. An archive with a byte limit always passes.
 ///
 /// # Errors
 /// Fails if `found` is more than [`MAX_SHORTFALL`] below the smaller of `asked` and [`ENOUGH_PSNR`]. Then some values
@@ -205,9 +205,9 @@ pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -
     }
 }
 
-/// Searches the numbers from `low` to `high` for the one nearest to `high` at which `evaluate` returns a result. Makes
-/// `halvings` bisection steps. Assumes that `evaluate` also returns a result at every number between `low` and the
-/// number sought. `low` may be larger than `high`. Returns the result at the best tried number, or `None` if no tried
+/// Searches the numbers from `low` to `high` for the one nearest to `high` at which `evaluate` returns a result (not
+/// `None`). Makes `halvings` bisection steps. Assumes that `evaluate` returns results from `low` up to some number, and
+/// none beyond it. `low` may be larger than `high`. Returns the result at the best tried number, or `None` if no tried
 /// number has a result.
 pub(crate) fn bisect<T>(
     [mut low, mut high]: [f64; 2],

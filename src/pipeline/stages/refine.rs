@@ -9,8 +9,8 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets;
 use crate::scene::Scene;
 
-/// Adds the refinement stage to `stages` if the recipe refines and memory suffices. Records the parts of refinement
-/// that are omitted for lack of memory.
+/// Adds the refinement stage to `stages` if the recipe asks for refinement and the memory limit allows it. Records the
+/// parts of refinement that are omitted for lack of memory.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     for (what, bytes) in planning.fallback.left_out() {
         let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));
@@ -31,9 +31,9 @@ impl Stage for RefineStage {
         format!("refine: {steps} steps at the end, {cut_steps} before a prune step, toward {pictures} views")
     }
 
-    /// Returns whether refinement may be unnecessary, because the run removes only Gaussians whose removal hardly
-    /// changes renders. `hardly_seen` is the fraction of such Gaussians. The result may then be close enough to the
-    /// original without refinement.
+    /// Returns whether refinement may be unnecessary: the run removes so few Gaussians that the PSNR of renders against
+    /// the original may stay above 60 dB without it. `hardly_seen`: fraction of the Gaussians that can be removed
+    /// before the PSNR falls below 60 dB.
     fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
         input.output_fraction >= 1.0 - hardly_seen
     }

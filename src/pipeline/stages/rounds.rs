@@ -152,8 +152,9 @@ impl Rounds {
         rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
 
-    /// Chooses the views by which Gaussians are ranked, and returns them divided into groups (turns). Views of a frame
-    /// are in the same group if there are at least as many frames as groups; otherwise views are divided one by one.
+    /// Chooses the views by which Gaussians are ranked, and returns them divided into groups (turns). All views of a
+    /// frame are in the same group; only if there are fewer frames than groups, each view is assigned to a group on its
+    /// own.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
         let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_cover);
         let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();

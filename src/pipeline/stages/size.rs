@@ -110,10 +110,12 @@ impl ByteLimit {
         Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
-    /// Returns how many of the Gaussians `ids` fit the byte limit ([`ByteLimit::count`]), for one or more SH degrees.
-    /// The first degree is that of `template`. If `drops`, lower degrees follow in decreasing order, up to the first
-    /// degree at which all Gaussians fit. `template` holds the other settings of the model, `recipe` is the size of the
-    /// recipe file, bytes.
+    /// Returns how many of the Gaussians `ids` fit the byte limit ([`ByteLimit::count`]), for one or more SH degrees:
+    /// - if `drops` is false, for the degree of `template` only;
+    /// - if `drops` is true, also for lower degrees in decreasing order, up to the first degree at which all Gaussians
+    ///   fit.
+    ///
+    /// `template` holds the other settings of the model. `recipe`: size of the recipe file, bytes.
     ///
     /// # Errors
     /// Fails in the cases in which [`ByteLimit::count`] fails.
@@ -244,8 +246,8 @@ impl ByteLimit {
         })
     }
 
-    /// Returns the indices in `compressed` of `count` Gaussians: those that must stay, then those with the highest
-    /// removal errors.
+    /// Chooses the `count` Gaussians of `compressed` that stay: those that must stay, then those with the highest
+    /// removal errors (squared error of renders caused by removing one). Returns their indices in `compressed`.
     fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(compressed)?;
         let places: Vec<u32> = (0..compressed.len() as u32).collect();

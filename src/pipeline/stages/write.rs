@@ -262,9 +262,13 @@ impl WriteStage {
     }
 
     /// Writes the result and the files beside it (recipe, index map, summary) under temporary names, and renames them
-    /// at the end: a folder in one step, a result file after the files beside it. `map` holds for every input Gaussian
-    /// its index in the output, `archive` the content of the archive if one is written, `recipe` the text of the recipe
-    /// file. `summarize` makes the summary from the journal and the size of the result. Returns the summary.
+    /// at the end. A result folder is renamed in one step; a result file is renamed after the files beside it. Returns
+    /// the summary.
+    ///
+    /// - `map`: for every input Gaussian its index in the output;
+    /// - `archive`: content of the archive, if one is written;
+    /// - `recipe`: text of the recipe file;
+    /// - `summarize`: makes the summary from the journal and the size of the result.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails; no output is left behind then.

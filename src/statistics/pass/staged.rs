@@ -90,9 +90,13 @@ fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>
     }
 }
 
-/// Decodes the units of work that a lane receives through `fetched`, and sends each with its reader to `decoded`. The
-/// accumulating thread of the lane returns readers through `free`. Such a reader is used again if it reads the same
-/// block of Gaussians.
+/// Decodes units of work (a block of Gaussians at the frames of one frame block). Body of the decoding thread of a lane
+/// (a decoding thread and an accumulating thread).
+///
+/// - `fetched`: yields the units of this lane, whose bytes are in the file cache.
+/// - `free`: yields the readers that the accumulating thread of the lane has finished with. A reader is used again if
+///   it reads the same block of Gaussians.
+/// - `decoded`: receives each unit with its reader, from which its frames can now be read, or with an error.
 fn decode<'a>(
     scan: &BlockScans<'a>,
     fetched: &Receiver<Unit>,
@@ -113,10 +117,13 @@ fn decode<'a>(
     }
 }
 
-/// Adds frames to the statistics. Body of the accumulating thread of a lane (a decoding thread and an accumulating
-/// thread). `ready` yields the units of work (a block of Gaussians at the frames of one frame block) that the decoding
-/// thread has decoded, each with its reader; the readers are returned through `done`. The results of finished blocks,
-/// and errors, are stored in `found`.
+/// Adds decoded frames to the statistics. Body of the accumulating thread of a lane (a decoding thread and an
+/// accumulating thread).
+///
+/// - `ready`: yields the units of work (a block of Gaussians at the frames of one frame block) that the decoding thread
+///   of the lane has decoded, each with its reader.
+/// - `done`: receives the readers, for use by the decoding thread.
+/// - `found`: receives the results of finished blocks, and errors.
 fn accumulate<'a>(
     scan: &BlockScans<'a>,
     ready: &Receiver<(Unit, Result<BlockReaderOf<'a>>)>,

@@ -149,7 +149,7 @@ pub fn score_with_passes(
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
 
-/// State of the computation of the scores, which are weighted sums of normalized quantities.
+/// Working state while the scores are computed, as weighted sums of normalized quantities.
 struct Summation<'a> {
     is_finite: &'a [bool],
     recipe: &'a recipe::ScoreParams,

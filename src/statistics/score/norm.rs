@@ -1,4 +1,5 @@
-//! Robust normalization of a statistic: the range between its 1st and its 99th percentile is mapped to 0 to 1.
+//! Robust normalization of statistics: [`Norm`] maps the range between the 1st and the 99th percentile of a quantity to
+//! 0 to 1.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,13 +22,13 @@ pub struct Norm {
     clip: bool,
 }
 
-/// Number of passes over the values that are made to find a percentile.
+/// How percentiles are found: exactly, in two passes over the values, or approximately, in one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PercentilePasses {
     /// Two passes over the values, which find the exact percentile.
     Two,
-    /// One pass, with a histogram whose keys have this number of mantissa bits. The result is the middle of the
-    /// histogram bucket that contains the percentile.
+    /// One pass, with a histogram. The number is how many mantissa bits of a value are part of the key of its histogram
+    /// bucket. The result is the middle of the bucket that contains the percentile.
     One(u32),
 }
 

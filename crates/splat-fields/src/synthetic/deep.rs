@@ -28,8 +28,8 @@ pub const ALL_VARIANTS: [DeepVariant; 3] = [
     DeepVariant { time_network: true, screws: false, all_heads: true },
 ];
 
-/// Returns the tensors `network.*` of a network with five layers, of which the fourth has a skip connection. Its
-/// outputs are of the order of 1.
+/// Returns random tensors `network.*` for a network of the variant `kind` with five layers, of which the fourth has a
+/// skip connection. The weights are such that its outputs are of the order of 1.
 pub fn random_tensors(kind: DeepVariant) -> Tensors {
     let mut noise = Noise(5);
     let mut tensors = Tensors::new();

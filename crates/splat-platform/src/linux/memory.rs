@@ -62,7 +62,8 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
     }
 }
 
-/// Mount of a hierarchy of control groups in the file system. The mounted part is one group with all groups below it.
+/// Mount of a hierarchy of control groups (cgroups) in the file system. A mount shows one control group and all groups
+/// below it as folders.
 struct Mount {
     /// Path of the mounted group within the hierarchy of control groups; `/` if the whole hierarchy is mounted.
     root: PathBuf,
@@ -89,7 +90,7 @@ impl Mount {
     }
 
     /// Returns the folder in the file system that represents the control group `path`. Returns the mount point if the
-    /// group is not in the mounted part of the hierarchy.
+    /// mount does not show this group.
     fn folder_of(&self, path: &str) -> PathBuf {
         let inside = Path::new(path).strip_prefix(&self.root).unwrap_or(Path::new(""));
         // With `..`, the path is relative to the root of a control group namespace that does not contain this process.
@@ -100,8 +101,8 @@ impl Mount {
     }
 }
 
-/// Returns the soft limits of the address space and of the data size of this process. `read` returns the text of a
-/// system file.
+/// Returns the soft limits that `ulimit` sets for this process: address space and data size. `read` returns the text of
+/// a system file, or `None` if it cannot be read.
 fn process_limits(read: &impl Fn(&Path) -> Option<String>) -> Vec<MemoryLimit> {
     let text = read(Path::new("/proc/self/limits")).unwrap_or_default();
     let soft = |name: &str, source| {

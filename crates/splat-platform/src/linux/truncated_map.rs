@@ -60,8 +60,8 @@ fn write(bytes: &[u8]) {
     unsafe { libc::write(libc::STDERR_FILENO, bytes.as_ptr().cast(), bytes.len()) };
 }
 
-/// Writes the path of the file that is mapped at the memory address `address` to `path`. Returns the number of bytes of
-/// the path, or 0 if the file is unknown.
+/// Finds the file that is mapped at the memory address `address`, and writes its path to `path`. Returns the number of
+/// bytes of the path, or 0 if no file is found.
 ///
 /// Reads `/proc/self/maps` with only open and read, which are async-signal-safe, and allocates nothing.
 fn path_mapped_at(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
@@ -96,7 +96,8 @@ fn path_mapped_at(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
 struct MapsLine {
     /// Start and end address of the memory region that the line describes.
     range: [usize; 2],
-    /// Number of separators read so far: a dash and five runs of blanks come before the path.
+    /// Index of the field of the line that is being read: 0 for START, 1 for END, and so on up to 6 for PATH. START
+    /// ends at a dash, the following fields end at a run of blanks.
     field: usize,
     /// Whether the last byte was a blank.
     after_blank: bool,

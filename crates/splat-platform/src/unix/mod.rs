@@ -122,8 +122,8 @@ pub fn create_private_folder(path: &Path) -> io::Result<()> {
     DirBuilder::new().mode(PRIVATE).create(path)
 }
 
-/// Returns the permissions of a private folder, which only its owner may access. Serves callers that create such a
-/// folder without [`create_private_folder`]. Returns `None` on systems on which a folder has the permissions of its
+/// Returns the permissions of a private folder, which only its owner may access, for callers that do not create the
+/// folder with [`create_private_folder`]. Returns `None` on systems on which a folder has the permissions of its
 /// parent.
 pub fn private_permissions() -> Option<Permissions> {
     Some(Permissions::from_mode(PRIVATE))

@@ -4,9 +4,11 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::exit;
 
-/// Installs a handler for the signals SIGINT, SIGTERM and SIGHUP. The handler calls `clean_up` and ends the process
-/// with the code that `exit_code` returns for the number of the signal. The value that `clean_up` returns is kept until
-/// the process ends. A signal that the process already ignores, for example because of `nohup`, stays ignored.
+/// Installs a handler for the signals SIGINT, SIGTERM and SIGHUP, which ask the process to end.
+///
+/// - The handler calls `clean_up`. The value that `clean_up` returns is kept until the process ends.
+/// - It then ends the process with the exit code that `exit_code` returns for the number of the signal.
+/// - A signal that the process already ignores, for example because of `nohup`, stays ignored.
 ///
 /// Also makes the process ignore SIGXFSZ: a write beyond the file size limit of `ulimit -f` then fails with an error
 /// instead of ending the process.

@@ -3,7 +3,8 @@
 //!
 //! Each operation first checks that the path still leads to the folder that was opened, without a link. Another program
 //! may replace the folder between this check and the operation; the implementation for Linux and macOS excludes this.
-//! No folder counts as one of this user, so the program reuses and removes only folders that this process has created.
+//! The owner of a folder is not read: [`FolderStatus::is_own`] is always false. So the program reuses and removes only
+//! folders that this process has created, never those that an earlier run left.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, OpenOptions};

@@ -1,12 +1,15 @@
-//! Gradients of renders: computes the derivatives of a loss L with respect to the stored attributes of Gaussians from
-//! its derivatives ∂L/∂pixel with respect to the pixels.
+//! Gradients of renders: computes the derivatives of a loss L with respect to the stored attributes of Gaussians.
 //!
-//! The steps are: the render as in [`render`](super::render), a loss of the caller, a backward pass over the splats of
-//! each tile (`tile`), and the derivative of the projection (`splat`). Input: [`Gaussians`] and a
-//! [`Camera`](splat_core::Camera). Output: [`Gradients`]. Memory in addition to that of the render: 72 bytes per
-//! visible Gaussian ([`GRADIENT_BYTES_PER_VISIBLE`] includes the render), and 36 bytes per (splat, tile) pair of a part
-//! of a strip ([`GRADIENT_STRIP_BYTES`]). Sources of the forward model: Kerbl et al., "3D Gaussian Splatting", 2023,
-//! and Ye et al., "gsplat", 2024. The gradients are derived in docs/method.md, section 8.1.
+//! The steps are:
+//! - render the image as in [`render`](super::render);
+//! - compute ∂L/∂pixel for every pixel by a function of the caller;
+//! - compute sums over pixels for each splat by a backward pass over the splats of each tile (`tile`);
+//! - compute the gradients of Gaussians from these sums by the derivative of the projection (`splat`).
+//!
+//! Input: [`Gaussians`] and a [`Camera`](splat_core::Camera). Output: [`Gradients`]. Memory in addition to that of the
+//! render: 72 bytes per visible Gaussian ([`GRADIENT_BYTES_PER_VISIBLE`] includes the render), and 36 bytes per (splat,
+//! tile) pair of a part of a strip ([`GRADIENT_STRIP_BYTES`]). Sources of the forward model: Kerbl et al., "3D Gaussian
+//! Splatting", 2023, and Ye et al., "gsplat", 2024. The gradients are derived in docs/method.md, section 8.1.
 //!
 //! Discontinuities of the render are ignored: an alpha that crosses 1/255, a changed depth order, a tile that a splat
 //! newly touches. An alpha clamped at 0.99, a channel clamped at 0 and a scale beyond e^±80 have derivative 0.
@@ -33,8 +36,8 @@ const SPAN: usize = 32 * BLOCK;
 
 /// Bytes of memory per visible Gaussian for a render and for the gradient of a loss of this render.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
-/// Maximum number of (splat, tile) pairs whose gradient sums are in memory. A strip of tiles with more pairs is
-/// processed in parts.
+/// Maximum number of (splat, tile) pairs whose gradient sums are in memory at a time. A strip (the tiles that are
+/// processed together) with more pairs is processed in parts.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
 /// Bytes of memory for the (splat, tile) pairs of a strip of tiles, for a render and for the gradient of a loss of this
@@ -42,13 +45,16 @@ const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<SplatSums<f32>>();
 
 impl Renderer {
-    /// Renders like [`Renderer::render`] and adds the derivatives of a loss of the image with respect to the stored
-    /// attributes of `gaussians` to `out`.
+    /// Renders an image like [`Renderer::render`], calls `loss` for it, and adds the derivatives of this loss with
+    /// respect to the stored attributes of `gaussians` to `out`. Returns the loss.
     ///
-    /// `loss` gets the image and returns the loss and its derivative with respect to each value of the image. Returns
-    /// the loss. If `view` renders a grid of pixels, the image has the size of the grid, and the derivatives are those
-    /// of the loss of these pixels alone. Results have the same bits for any number of threads. A pixel whose color or
-    /// derivative is not finite has no effect on gradients. Gaussians that are not visible get gradient 0.
+    /// - `loss` gets the image and returns two values: the loss, and its derivative with respect to each value of the
+    ///   image.
+    /// - If `view` renders a grid of pixels, the image has the size of the grid, and only these pixels take part in the
+    ///   loss.
+    /// - A pixel whose color or derivative is not finite has no effect on gradients.
+    /// - Gaussians that are not visible get gradient 0.
+    /// - Results have the same bits for any number of threads.
     ///
     /// # Panics
     /// Panics if `out` has another number of Gaussians or a higher SH degree than `gaussians`, if the attributes of
@@ -95,9 +101,10 @@ impl Renderer {
         value
     }
 
-    /// Computes the gradient sums of every splat from the derivative `pixel_gradient` of the loss with respect to
-    /// `image`. If `SHAPE` is false, computes only the sums for the gradients of colors. First, tiles are processed in
-    /// parallel; then, for each splat in parallel, the sums of its tiles are added in a fixed order.
+    /// Computes the gradient sums of every splat from `pixel_gradient`, the derivative of the loss with respect to each
+    /// value of `image`. First computes the sums over each tile, with tiles in parallel. Then adds the sums of the
+    /// tiles of each splat in a fixed order, with splats in parallel. If `SHAPE` is false, computes only the sums for
+    /// the gradients of colors.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();

@@ -16,8 +16,8 @@ use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat,
 use super::sums::SplatSums;
 use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficients};
 
-/// Adds the gradients of the Gaussians of `splats` to `out`, which must contain these Gaussians. `sums` holds the
-/// gradient sums of each splat over its pixels.
+/// Computes the gradients of the Gaussians whose projections are `splats`, and adds them to `out`, which must contain
+/// these Gaussians. `sums` holds the gradient sums of each splat over its pixels.
 pub(super) fn add(
     gaussians: &Gaussians,
     splats: &[Splat],
@@ -65,7 +65,8 @@ pub(super) fn add(
     add_blocks(gaussians, splats, sums, view, out);
 }
 
-/// Adds the gradients of the Gaussians of `splats` to `out` like [`add`], in blocks of [`BLOCK`] Gaussians.
+/// Does the same as [`add`], for [`BLOCK`] Gaussians at a time. Inlined, so that each instruction set has its own
+/// compiled version.
 #[inline(always)]
 fn add_blocks(
     gaussians: &Gaussians,
@@ -187,8 +188,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds to `out` the part of the gradients of positions that comes from the color, which depends on the view
-    /// direction.
+    /// Adds to `out` one of the two parts of the gradients of positions: moving a Gaussian changes its view direction,
+    /// and thereby its color.
     #[inline(always)]
     fn add_direction(
         &self,
@@ -227,8 +228,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds to `out` the gradients of opacity, scale and rotation, and the part of the gradients of positions that
-    /// comes from the footprint.
+    /// Adds the gradients of opacity, scale and rotation to `out`. Also adds the second part of the gradients of
+    /// positions: moving a Gaussian changes the place and the shape of its footprint.
     #[inline(always)]
     fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
@@ -279,8 +280,8 @@ struct GeometryGradient {
 }
 
 impl GeometryGradient {
-    /// Computes the derivatives from the stored attributes of the Gaussian (`q` is the quaternion in the order w, x, y,
-    /// z) and from the gradient sums of its splat: `[x, y]` is [`SplatSums::first`], and `[xx, xy, yy]` is
+    /// Computes the derivatives for one Gaussian from its stored attributes and from the gradient sums of its splat.
+    /// `q` is the quaternion in the order w, x, y, z; `[x, y]` is [`SplatSums::first`], and `[xx, xy, yy]` is
     /// [`SplatSums::second`].
     #[inline(always)]
     fn new(

@@ -12,7 +12,8 @@ use super::super::project::Splat;
 use super::super::renderer::Image;
 use super::sums::SplatSums;
 
-/// Largest f32 below [`MAX_ALPHA`]. An alpha above it has been clamped to `MAX_ALPHA`, so its derivative counts as 0.
+/// Largest alpha that is not clamped: the largest f32 below [`MAX_ALPHA`]. An alpha above it has been clamped to
+/// `MAX_ALPHA`, so its derivative counts as 0.
 const MAX_UNCLAMPED_ALPHA: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
 
 /// Gradients ∂L/∂pixel of the loss with respect to the pixels of a tile, and for each pixel the color that comes from
@@ -25,8 +26,9 @@ pub(super) struct PixelGradients {
 }
 
 impl PixelGradients {
-    /// Copies the tile in column `tile[0]` and row `tile[1]` of `image` and of its `gradient`. A pixel whose color or
-    /// gradient is not finite gets gradient 0.
+    /// Copies the pixels in tile column `tile[0]` and tile row `tile[1]` from `image` and from `gradient`, the
+    /// derivative of the loss with respect to each value of `image`. A pixel whose color or gradient is not finite gets
+    /// gradient 0.
     pub(super) fn new(image: &Image, gradient: &Image, tile: [u32; 2]) -> Self {
         // Copies whole tiles first: their reads wait for memory at the same time, whereas reads of single pixels would
         // wait one by one.

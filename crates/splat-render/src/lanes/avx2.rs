@@ -138,8 +138,8 @@ impl Sums for Avx2 {
         self.store(&mut values, 0);
         values[0]
     }
-    /// Returns the total of the eight lanes of each of eight `sums`. They are computed together: each addition halves
-    /// the number of registers, so eight totals cost little more than two.
+    /// Returns eight totals, each over the eight lanes of one of the `sums`. They are computed together: each addition
+    /// halves the number of registers, so eight totals cost little more than two.
     #[inline(always)]
     fn totals(sums: [Self; LANES]) -> [f32; LANES] {
         let halves = |a: Self, b: Self| {

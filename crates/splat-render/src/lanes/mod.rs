@@ -2,9 +2,11 @@
 //! of groups of eight lanes, one pixel per lane.
 //!
 //! All implementations give the same bits. Every operation is a single IEEE operation. Multiply-adds are not fused:
-//! fused ones would make renders depend on the machine, and are slow without hardware support. An AVX-512 vector has
-//! two groups, the others have one. To sum over groups with the same result, the two groups of an AVX-512 vector are
-//! added one after the other, or even and odd groups are summed separately on all machines ([`EvenOddSums`]).
+//! fused ones would make renders depend on the machine, and are slow without hardware support.
+//!
+//! An AVX-512 vector has two groups, a vector of the other implementations has one. There are two ways to sum over
+//! groups with the same result on all machines: the two groups of an AVX-512 vector are added one after the other, or
+//! the groups with even and with odd index are summed separately ([`EvenOddSums`]).
 
 mod portable;
 
@@ -63,8 +65,8 @@ pub(super) trait Lanes: Copy {
     /// Type of the sum of several groups of eight lanes. It has eight values: value k is the sum of lane k of all
     /// groups that were added.
     type Sums: Sums;
-    /// Type of two sums over groups of eight lanes: one over the groups with even index, one over the groups with odd
-    /// index. Each sum has eight values, one per lane.
+    /// Type of a pair of sums over groups of eight lanes: one sum over the groups with even index, and one over the
+    /// groups with odd index. Each sum has eight values, one per lane.
     type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
     /// Number of groups of eight lanes in a vector; a power of two.
     const GROUPS: usize;
@@ -76,8 +78,8 @@ pub(super) trait Lanes: Copy {
     fn splat(value: f32) -> Self;
     /// Returns a vector in which every group has the eight values of `group`.
     fn repeat(group: &[f32; LANES]) -> Self;
-    /// Returns a vector in which all lanes of group k hold the value with index `first + k` in the flattened array
-    /// `values`. `first` is a multiple of [`Lanes::GROUPS`].
+    /// Returns a vector that has a different value in each group: all lanes of group k hold
+    /// `values.as_flattened()[first + k]`. `first` is a multiple of [`Lanes::GROUPS`].
     fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self;
     /// Loads a vector from `from`, an array of groups of eight values: the [`Lanes::GROUPS`] groups from index `first`
     /// on. `first` is a multiple of [`Lanes::GROUPS`].
@@ -115,10 +117,12 @@ pub(super) trait Lanes: Copy {
     fn largest(self) -> f32;
     /// Adds each group of the vector to `sums`, one group after the other, and returns the result.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
-    /// Adds the groups with even index to the even sums and the groups with odd index to the odd sums, and returns the
-    /// result. A vector of one group is always added to the first of the two sums, see [`EvenOddSums`].
+    /// Adds the groups of the vector to two sums, the groups with even index to one and the groups with odd index to
+    /// the other, and returns the sums. A vector of one group is always added to the first of the two sums, see
+    /// [`EvenOddSums`].
     fn add_to_even_odd(self, sums: Self::EvenOddSums) -> Self::EvenOddSums;
-    /// Returns `self · 2ⁿ` in each lane. `rounded` is n + [`ROUND`], whose low bits hold n.
+    /// Returns `self · 2ⁿ` in each lane, for the integer n in this lane. `rounded` is n + [`ROUND`], whose low bits
+    /// hold n.
     fn scale(self, rounded: Self) -> Self;
 
     /// Computes 2^x of each lane x ≤ 0. The relative error is below 1.6e-7 down to 2⁻¹²⁶; for smaller x, the result is
@@ -148,8 +152,8 @@ pub(super) trait EvenOddSums: Copy {
     type Sums: Sums;
     /// Returns sums that are all 0.
     fn zero() -> Self;
-    /// Returns the two sums in swapped order if vectors have one group, so that the following groups are added to the
-    /// other sum. Returns them unchanged if vectors have two groups.
+    /// Returns the two sums, in swapped order if a vector has one group. Groups that are added later then go to the
+    /// other sum. If a vector has two groups, returns the sums unchanged.
     fn swapped(self) -> Self;
     /// Returns the even sum plus the odd sum in each lane.
     fn combined(self) -> Self::Sums;

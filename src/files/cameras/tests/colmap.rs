@@ -8,8 +8,9 @@ use glam::{DMat3, DVec3};
 use crate::files::cameras::{CameraOptions, TimesSource, load};
 use crate::model::Split;
 
-/// Writes cameras and images to `folder` as COLMAP does, in binary files if `binary` is true, else in text files.
-/// `lens` is the rest of a line of `cameras.txt` after the camera number.
+/// Writes a COLMAP reconstruction with one camera and three images to `folder`, in binary files if `binary` is true,
+/// else in text files. `lens` is the line of the camera in `cameras.txt` without its number: the name of the camera
+/// model, the width, the height and the parameters.
 fn write_colmap(folder: &Path, lens: &str, binary: bool) {
     let images: [(u32, [f64; 7], u32, &str); 3] = [
         (7, [0.5f64.sqrt(), 0.5f64.sqrt(), 0.0, 0.0, 1.0, 2.0, 3.0], 2, "cam1/frame_0003.png"),

@@ -1,9 +1,9 @@
 //! A 4DGaussians model folder as a sequence of frames.
 //!
 //! Input: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, frame times. Output: states of any
-//! Gaussians at any frame. Memory: the canonical Gaussians (44 + 12·(d+1)² bytes per Gaussian at SH degree d), the
-//! tensors of the field, and for each open reader a copy of the canonical Gaussians that it reads and
-//! [`Field::bytes_per_gaussian`] for each of them.
+//! Gaussians at any frame. Memory: the canonical Gaussians (44 + 12·(d+1)² bytes per Gaussian at SH degree d) and the
+//! tensors of the field. Each open reader takes in addition a copy of the canonical Gaussians that it reads, and
+//! [`Field::bytes_per_gaussian`] per Gaussian.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -282,8 +282,9 @@ impl Deformation for ModelFolder {
         &self.canonical
     }
 
-    /// Returns the attributes that the optimizer can change. Excludes positions if the field has a mask: derivatives
-    /// treat the mask as constant, so a moved position would be worse than an unchanged one.
+    /// Returns the attributes that the optimizer can change. Excludes positions if the field has a mask (factor on the
+    /// stored attributes of each Gaussian): derivatives treat the mask as constant, so a moved position would be worse
+    /// than an unchanged one.
     fn movable(&self) -> Attributes {
         if self.field.has_mask() { Attributes::all().difference(Attributes::POSITION) } else { Attributes::all() }
     }
@@ -297,8 +298,8 @@ impl Deformation for ModelFolder {
     }
 }
 
-/// Gaussians of a 4DGaussians model with given stored parameters. Their states are computed a block of Gaussians at a
-/// time.
+/// Gaussians with given stored parameters, deformed by the field of a 4DGaussians model. Their states are computed a
+/// block of Gaussians at a time.
 struct PreparedModel<'a> {
     model: &'a ModelFolder,
     stored: &'a StoredParams,
