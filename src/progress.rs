@@ -6,6 +6,24 @@ use std::fmt::{self, Debug};
 use std::sync::Arc;
 
 /// Receiver of the events of runs. Methods are called from any thread; default implementations ignore the event.
+///
+/// # Examples
+/// ```
+/// use splatsieve::progress::{EventSink, Events, Message};
+///
+/// struct Warnings;
+///
+/// impl EventSink for Warnings {
+///     fn message(&self, message: Message<'_>) {
+///         if let Message::Warning(text) = message {
+///             println!("warning: {text}");
+///         }
+///     }
+/// }
+///
+/// let events = Events::new(Warnings); // for InputOptions::events
+/// events.send(Message::Warning("few cameras"));
+/// ```
 pub trait EventSink: Send + Sync {
     /// Receives the event that a run begins, with its `stages` in order. Each stage then begins with a task of the
     /// stage's name ([`EventSink::task_begun`]).

@@ -61,3 +61,8 @@ pub use recover::{RecoverReport, recover, recover_within};
 pub use text::{ShowPath, ShownPath, printable, quoted};
 pub use verify::VerifyReport;
 pub use writer::Writer;
+
+/// Compiles the example in the README of this crate as a documentation test.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

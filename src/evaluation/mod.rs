@@ -83,6 +83,43 @@ pub struct EvaluateOptions {
 /// # Errors
 /// Fails if inputs, cameras or photographs cannot be read, if the models have different frames, or if the CSV file
 /// cannot be written.
+///
+/// # Examples
+/// Compares a model with itself in every view:
+///
+/// ```
+/// # use std::collections::BTreeMap;
+/// # use splatsieve::diagnostics::demo_scene::{DemoScene, cameras_json};
+/// # use splatsieve::outputs::container::write_container;
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let folder = tempfile::tempdir()?;
+/// # let [model, cameras] = ["scene.gseq", "cameras.json"].map(|name| folder.path().join(name));
+/// # let made = DemoScene::new(400, 4);
+/// # write_container(&made, &model, gseq::Compression::Zstd(1), BTreeMap::new(), |_| ())?;
+/// # std::fs::write(&cameras, cameras_json(&made.rig()))?;
+/// use splatsieve::cache::Completion;
+/// use splatsieve::evaluation::{EvaluateOptions, evaluate};
+/// use splatsieve::files::atomic::Replace;
+/// use splatsieve::scene::InputOptions;
+/// use splatsieve::scene::view_selection::ViewSet;
+///
+/// let options = EvaluateOptions {
+///     original: InputOptions { path: model.clone(), cameras: Some(cameras), ..InputOptions::default() },
+///     compressed: model,
+///     ground_truth: None,
+///     views: ViewSet::All,
+///     max_frames: None,
+///     max_views: None,
+///     background: None,
+///     flip: false,
+///     csv: None,
+///     overwrite: Replace::Never,
+/// };
+/// let Completion::Whole(found) = evaluate(&options)? else { panic!("the run is not divided into shards") };
+/// assert!(found.loss.overall.ssim > 0.999_999);
+/// # Ok(())
+/// # }
+/// ```
 pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
     Completion::from_result(evaluate_whole(options))
 }

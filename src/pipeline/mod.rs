@@ -44,6 +44,35 @@ use summary::{InputSummary, Summary};
 ///
 /// # Errors
 /// Fails if the input, the cameras, the recipe or the output is invalid. An error leaves no output behind.
+///
+/// # Examples
+/// Keeps half of the Gaussians of a container and does not refine them:
+///
+/// ```
+/// # use std::collections::BTreeMap;
+/// # use splatsieve::diagnostics::demo_scene::{DemoScene, cameras_json};
+/// # use splatsieve::outputs::container::write_container;
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let folder = tempfile::tempdir()?;
+/// # let [model, cameras] = ["scene.gseq", "cameras.json"].map(|name| folder.path().join(name));
+/// # let made = DemoScene::new(400, 4);
+/// # write_container(&made, &model, gseq::Compression::Zstd(1), BTreeMap::new(), |_| ())?;
+/// # std::fs::write(&cameras, cameras_json(&made.rig()))?;
+/// use splatsieve::cache::Completion;
+/// use splatsieve::pipeline::{Request, Target, compress};
+/// use splatsieve::recipe::Recipe;
+/// use splatsieve::scene::InputOptions;
+///
+/// let input = InputOptions { path: model, cameras: Some(cameras), ..InputOptions::default() };
+/// let recipe = Recipe::from_toml("[refine]\nrefine = \"none\"\n", "default")?;
+/// let output = folder.path().join("small.gseq");
+/// let request = Request { target: Some(Target::Ratio(0.5)), ..Request::new(input, output.clone(), recipe) };
+/// let Completion::Whole(summary) = compress(&request)? else { panic!("the run is not divided into shards") };
+/// assert_eq!(summary.gaussians, 200);
+/// assert!(output.is_file());
+/// # Ok(())
+/// # }
+/// ```
 pub fn compress(request: &Request) -> Result<Completion<Summary>> {
     Completion::from_result(compress_whole(request))
 }

@@ -122,6 +122,27 @@ fn check_frames(opened: OpenedInput, path: &Path) -> Result<OpenedInput> {
 ///
 /// # Errors
 /// Fails as [`open_input`] does, and if the split has no views.
+///
+/// # Examples
+/// ```
+/// # use std::collections::BTreeMap;
+/// # use splatsieve::diagnostics::demo_scene::{DemoScene, cameras_json};
+/// # use splatsieve::outputs::container::write_container;
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let folder = tempfile::tempdir()?;
+/// # let [model, cameras] = ["scene.gseq", "cameras.json"].map(|name| folder.path().join(name));
+/// # let made = DemoScene::new(400, 4);
+/// # write_container(&made, &model, gseq::Compression::Zstd(1), BTreeMap::new(), |_| ())?;
+/// # std::fs::write(&cameras, cameras_json(&made.rig()))?;
+/// use splatsieve::scene::{InputOptions, open_scene};
+///
+/// let scene = open_scene(&InputOptions { path: model, cameras: Some(cameras), ..InputOptions::default() })?;
+/// let info = scene.source().info();
+/// assert_eq!((info.count, info.times.len()), (400, 4));
+/// assert_eq!(scene.rig.cameras.len(), 6);
+/// # Ok(())
+/// # }
+/// ```
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     from_input(open_input(options)?, options)
 }

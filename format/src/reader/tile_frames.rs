@@ -11,8 +11,8 @@ use crate::error::Result;
 use crate::layout::TileId;
 use crate::record::TileRecord;
 
-/// Frames of one tile (one column for a block of Gaussians and frames), decoded one at a time, fastest in increasing
-/// order; see [`Reader::load`].
+/// Frames of one tile (one column for a block of Gaussians and frames), which are decoded one at a time. Reading them
+/// in increasing order is fastest. [`Reader::load`] loads a tile.
 ///
 /// Memory: a compressed tile takes 4 bytes per value of all its frames and 8 bytes per value of one frame. A raw tile
 /// (plain f32) takes no memory; if it is read in place from the memory map, the pages that were read count as memory
@@ -47,16 +47,17 @@ pub struct TouchedPages {
 }
 
 impl Reader {
-    /// Loads the tile `at` into `frames`, from which its frames can then be read. Decompresses a compressed tile.
-    /// Checks the checksum of a raw tile (plain f32) if no earlier call has checked it. `buffer` is used only while
-    /// loading. Fails if there is no such tile, if its bytes are damaged, or if they cannot be read.
+    /// Loads the tile `at` into `frames`, from which its frames can then be read. A compressed tile is checked against
+    /// its checksum and decompressed. A raw tile (plain f32) is checked unless an earlier call has checked it. `buffer`
+    /// is used only while loading. Fails if there is no such tile, if its bytes are damaged, or if they cannot be read.
     ///
     /// `touched` selects between two ways of reading the stored bytes:
-    /// - `Some`: reads them in place from the memory map, under the conditions of [`Reader::tile`]. Adds the range of
-    ///   the read bytes to `touched`, so that the caller can release their pages with [`Reader::release`]: those of a
-    ///   compressed tile after this call, those of a raw tile after its last frame was read.
-    /// - `None`: reads them by system calls, as [`Reader::read_tile`] does. This is cheaper if only one frame of a raw
-    ///   tile is read before its pages are released.
+    /// - `Some`: in place, from the memory map. [`Reader::tile`] states what happens if the file changes meanwhile. The
+    ///   range of the read bytes is added to `touched`, so that the caller can release their pages with
+    ///   [`Reader::release`]: the pages of a compressed tile after this call, the pages of a raw tile after its last
+    ///   frame was read.
+    /// - `None`: by system calls, as [`Reader::read_tile`] does. This is cheaper if only one frame of a raw tile is
+    ///   read before its pages are released.
     pub fn load(
         &self,
         at: TileId,
@@ -107,9 +108,9 @@ impl Reader {
         Ok(())
     }
 
-    /// Writes the values of frame `frame` of the loaded tile to `out`, laid out as `[width, len]`. Of a raw tile only
-    /// this frame is read from the file, or copied from the memory map if the tile was loaded in place. Fails if the
-    /// file has become too short.
+    /// Writes the values of frame `frame` of the loaded tile to `out`, laid out as `[width, len]`: components ×
+    /// Gaussians. Of a raw tile (plain f32) only this frame is read from the file, or copied from the memory map if the
+    /// tile was loaded in place. Fails if the file has become too short.
     ///
     /// # Panics
     /// Panics if `out` has another size, if no tile was loaded into `frames` by this reader, or if the tile has no such
@@ -135,8 +136,9 @@ impl Reader {
         Ok(())
     }
 
-    /// Returns the values of frame `frame` of the loaded tile like [`Reader::read_frame`]: as a slice of the memory map
-    /// if the tile is raw and was loaded in place, otherwise in `buffer`. Fails if the file has become too short.
+    /// Returns the values of frame `frame` of the loaded tile, laid out as `[width, len]`: components × Gaussians. They
+    /// are a slice of the memory map if the tile is raw (plain f32) and was loaded in place; otherwise they are written
+    /// to `buffer`. Fails if the file has become too short.
     ///
     /// # Panics
     /// Panics if no tile was loaded into `frames` by this reader, or if the tile has no such frame.
@@ -155,8 +157,9 @@ impl Reader {
         Ok(buffer)
     }
 
-    /// Writes all stored values of the loaded tile to `out`, laid out as `[frames, width, len]`; only one frame if all
-    /// frames of the tile are equal. Fails if the file has become too short.
+    /// Writes all stored values of the loaded tile to `out`, laid out as `[frames, width, len]`: frames × components ×
+    /// Gaussians. If all frames of the tile are equal, only one is stored and written. Fails if the file has become too
+    /// short.
     ///
     /// # Panics
     /// Panics if `out` has another size, or no tile was loaded.
