@@ -137,8 +137,8 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
 }
 
 /// Compares the compressed model that `options` name with the original, and returns everything that the page shows of
-/// it. `wanted` lists the renders to show; if it is `None`, this function chooses them. `render_time` states whether to
-/// measure render times.
+/// this compressed model. `wanted` lists the renders to show; if it is `None`, this function chooses them.
+/// `render_time` states whether to measure render times.
 fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
     let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
@@ -209,8 +209,8 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     Ok(Analysis { data, run, shown, films, close })
 }
 
-/// Maximum size in bytes of a JSON file of `sweep` or `precision` that is read. A thousand runs take less than one
-/// million bytes.
+/// Maximum size in bytes of a JSON file of `sweep` or `precision` that is read. A file about a thousand runs has less
+/// than one million bytes.
 const MAX_FOUND: u64 = 16 << 20;
 
 /// Reads the JSON file at `path`, which the command `command` (`sweep` or `precision`) wrote.
@@ -270,7 +270,7 @@ fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     first.map_or_else(|| scene.rig.schedule(times, None), Ok)
 }
 
-/// Returns a note if the percentiles of a term of the score differ from the percentiles of the run that wrote the
+/// Returns a note if the 1st or 99th percentile of a term of the score differs from that of the run that wrote the
 /// compressed model. The scores in the report then differ from the scores by which Gaussians were removed.
 fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
@@ -288,10 +288,13 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     ))
 }
 
-/// Returns for each of the three kinds of Gaussian (moving, thin, changing in appearance; [`GaussianKind`]) the number
-/// of its Gaussians, how many of them were dropped and merged, and their shares of the contribution, from the
-/// statistics `rows`. `traits` states of which kinds every Gaussian is. `fates` has the fate of every Gaussian (kept,
-/// merged or dropped); it is `None` without an index map (file that maps input to output Gaussians).
+/// Returns the totals of each of the three kinds of Gaussian ([`GaussianKind`]: fast, thin, changing in appearance):
+/// - the number of Gaussians of the kind, and how many of them were dropped and merged;
+/// - the fraction that the kind has of the contribution (Σ alpha · transmittance) of all Gaussians, and the fraction of
+///   the kind's contribution that its dropped and merged Gaussians have.
+///
+/// `rows` holds the statistics of every Gaussian, `traits` states of which kinds it is, and `fates` whether it was
+/// kept, merged or dropped. `fates` is `None` without an index map (file that maps input to output Gaussians).
 fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindTotals; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
@@ -305,9 +308,9 @@ fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -
     })
 }
 
-/// Renders again the views of `choices`, and the view in which each failure mode of `modes` is worst. Returns two
-/// lists: the images of each of `choices`, and the images of the worst place of each failure mode. Failure modes
-/// without a worst place are left out. `traits` has the kinds of every Gaussian.
+/// Renders again the views of `choices`, and for each failure mode of `modes` the view in which its damage is worst.
+/// Returns two lists: the images of each of `choices`, and for each failure mode the images of a square around the
+/// worst damage. Failure modes without a worst view are left out. `traits` has the kinds of every Gaussian.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],

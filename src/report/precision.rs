@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn every_error_has_a_diagram_over_time_and_the_first_over_memory_too() {
+    fn every_error_has_a_time_diagram_the_first_a_memory_diagram() {
         let marks =
             [4.0, 2.0, 1.0].map(|value| mark(value, &[("C", 0.1 / value), (ADDED_ERROR, 0.2 / value), ("W", 0.0)]));
         let charts = charts(&knob(marks.to_vec()));

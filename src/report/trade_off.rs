@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn every_point_that_is_known_is_drawn_once_in_its_methods_series() {
+    fn every_known_point_is_drawn_once_in_the_series_of_its_method() {
         let points = vec![
             point("random", 50, 20.0, None),
             point("default", 50, 40.0, Some(1 << 20)),
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_method_and_the_same_without_refining_are_a_pair_in_any_order() {
+    fn a_method_and_its_unrefined_form_are_a_pair_in_any_order() {
         let points = ["no-refine", "random", "default"].map(|name| point(name, 50, 30.0, None)).to_vec();
         let all = found(points.clone(), Vec::new());
         let drawn: Vec<(&str, bool)> = curves(&all).iter().map(|curve| (curve.name, curve.paired)).collect();

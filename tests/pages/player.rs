@@ -105,7 +105,7 @@ fn the_page_draws_as_the_rasterizer_and_asks_for_nothing() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn times_between_frames_are_interpolated_and_a_wipe_joins_models() {
+fn times_between_frames_are_interpolated_and_wipes_join_models() {
     let program = browser::installed();
     let (_at, whole) = demo();
     let mut page = Browser::start_drawing(&program);
@@ -268,7 +268,7 @@ fn controls_are_even_named_and_fit_a_phone() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn a_poster_stands_until_the_scene_is_drawn_and_embedding_hides_controls() {
+fn a_poster_stands_until_drawing_and_embedding_hides_controls() {
     let program = browser::installed();
     let (at, whole) = demo();
     let text = fs::read_to_string(&whole).unwrap();

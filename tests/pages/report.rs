@@ -236,7 +236,7 @@ fn absent_files_are_named_and_any_two_models_can_be_compared() {
 }
 
 #[test]
-fn a_report_replaces_only_a_result_and_wrong_inputs_leave_nothing() {
+fn a_report_replaces_only_results_and_errors_leave_nothing() {
     let at = compressed();
     let report = format!("report {MODELS} --max-frames 1");
     fs::create_dir(at.path("mine")).unwrap();

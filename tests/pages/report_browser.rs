@@ -206,7 +206,7 @@ const UNREADABLE: &str = "[...document.querySelectorAll('svg')].flatMap(svg => {
 
 #[test]
 #[ignore = "needs a browser"]
-fn a_sweep_draws_every_chart_with_words_that_can_be_read_and_asks_for_nothing() {
+fn a_sweep_draws_every_chart_with_readable_text_and_no_request() {
     let program = browser::installed();
     let at = Workplace::new();
     let steps = "--fractions 0.8,0.5,0.3 --steps 0,5,10,20 --steps-at 0.3";

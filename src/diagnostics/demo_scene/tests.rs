@@ -82,7 +82,7 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
 }
 
 #[test]
-fn still_bodies_do_not_change_by_a_bit_and_constant_columns_never_do() {
+fn still_bodies_and_constant_columns_keep_every_bit() {
     let scene = usual();
     for body in DemoBody::ALL {
         let film = film(&scene, body);
@@ -170,7 +170,7 @@ fn fading_cloud_is_monotone_and_crosses_the_threshold_of_life() {
 }
 
 #[test]
-fn sparks_live_once_and_briefly_at_different_times_and_rest_while_dead() {
+fn sparks_live_once_and_briefly_and_do_not_move_while_dead() {
     let film = film(&usual(), DemoBody::Spark);
     let mut first = Vec::new();
     for i in 0..film[0].len() {
@@ -216,7 +216,7 @@ fn wires_are_needles_and_dust_is_tiny() {
 }
 
 #[test]
-fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
+fn every_camera_sees_moving_bodies_and_none_a_buried_one() {
     let scene = usual();
     let rig = scene.rig();
     assert_eq!((rig.cameras.len(), rig.schedule(&scene.info().times, None).unwrap().pair_count()), (6, 6 * 48));

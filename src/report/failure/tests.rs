@@ -101,7 +101,7 @@ fn kinds_are_found_where_the_scene_has_them_and_nowhere_else() {
 }
 
 #[test]
-fn each_mode_is_flagged_where_its_own_kind_is_lost_and_only_there() {
+fn each_failure_mode_is_flagged_only_where_its_kind_is_lost() {
     let scene = looked();
     for (number, kind) in GaussianKind::ALL.into_iter().enumerate() {
         let found = scene.without(|i| scene.traits[i][number]);
