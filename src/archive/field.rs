@@ -84,8 +84,9 @@ pub struct TensorSteps {
     pub channels: Vec<i8>,
 }
 
-/// Places and times at which the deformation field is evaluated: canonical positions of the Gaussians, the box of space
-/// that the feature planes cover, and the range of times. They determine which texels are read.
+/// Positions and times at which the deformation field is evaluated. They determine which texels of its feature planes
+/// are read. `position` holds the canonical positions of the Gaussians. `space` is the box that the feature planes
+/// cover.
 #[derive(Debug)]
 pub(super) struct Readers<'a> {
     pub(super) position: &'a AttributeValues,
@@ -198,10 +199,12 @@ impl TensorEntry {
         (0..rows).flat_map(|row| (0..columns).map(move |column| class_at(row, column))).collect()
     }
 
-    /// Builds the description of this tensor that its coder needs (shape, stored rows and quantization grids), calls
-    /// `with` with it, and returns the result of `with`. Returns `None` without a call if no value of the tensor is
-    /// quantized. `readers` states where and when the deformation field is evaluated (positions of the Gaussians, box
-    /// of space, range of times). Of a feature plane, this determines the stored rows and the grid of each texel.
+    /// Builds the description of this tensor that its coder needs (shape, stored rows and quantization grids), passes
+    /// it to `with`, and returns the result of `with`. Returns `None` without a call if no value of the tensor is
+    /// quantized.
+    ///
+    /// `readers` holds the positions and times at which the deformation field is evaluated. They determine which texels
+    /// of a feature plane are read: the stored rows and the quantization grid of each texel follow from them.
     fn with_quantized<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
         if self.values() == Some(0) {
             return None;

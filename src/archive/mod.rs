@@ -46,18 +46,21 @@ pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 pub struct ArchiveContent {
     /// Canonical Gaussians.
     pub cloud: Gaussians,
-    /// Columns: values of the Gaussians beyond their attributes. Each column has one row per Gaussian of `cloud`.
+    /// Columns: values of the Gaussians that belong to no attribute, for example velocities. A column has one row per
+    /// Gaussian.
     pub columns: Vec<Column>,
-    /// For each tensor, by name: how the deformation field uses it. Empty if the model has no deformation field.
+    /// Use of each tensor by the deformation field, by the name of the tensor. Empty if the model has no deformation
+    /// field.
     pub field: BTreeMap<String, TensorRole>,
     /// Tensors of the deformation field, by name.
     pub tensors: Tensors,
     /// First and last time at which the deformation field is evaluated. They determine which texels are stored.
     pub times: [f32; 2],
-    /// Extra bytes of every Gaussian that belong to no attribute (for example, other PLY properties). Each Gaussian has
-    /// the same number of extra bytes; they are stored one Gaussian after another.
+    /// Bytes of every Gaussian that are stored unchanged, for example those of PLY properties that are not f32. Each
+    /// Gaussian has the same number of such bytes; they are stored one Gaussian after another.
     pub extra_bytes: Vec<u8>,
-    /// Files of the model that are stored without change, such as `cfg_args`, and other bytes, by name.
+    /// Blocks of bytes that are stored unchanged, by name: whole files of the model, such as `cfg_args`, and the parts
+    /// of its other files that are not values, such as headers.
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
@@ -72,7 +75,7 @@ pub struct QuantizationSteps {
     pub field: FieldSteps,
 }
 
-/// Encoded archive, with a list of what its bytes are used for.
+/// Encoded archive, with the number of bytes and bits that its contents take.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct EncodedArchive {
     /// Bytes of the archive file.
@@ -94,8 +97,8 @@ struct Table {
     /// would round these times.
     times: [u32; 2],
     tensors: Vec<TensorEntry>,
-    /// Number of bytes per Gaussian in [`ArchiveContent::extra_bytes`]: stored values that belong to no attribute, such
-    /// as other PLY properties.
+    /// Number of bytes per Gaussian in [`ArchiveContent::extra_bytes`]: bytes that are stored unchanged, for example
+    /// those of PLY properties that are not f32.
     beside: usize,
     /// Name and length in bytes of each entry of [`ArchiveContent::files`], in the order in which their bytes are
     /// stored.
@@ -136,7 +139,8 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
         files: content.files.iter().map(|(name, bytes)| (name.clone(), bytes.len())).collect(),
     };
     let mut blobs: Vec<u8> = exact.iter().flat_map(|value| value.to_le_bytes()).collect();
-    // The bytes are ordered by their place in the row of a Gaussian first, so that similar bytes are adjacent.
+    // Store the first extra byte of all Gaussians, then the second of all, and so on, so that similar bytes are
+    // adjacent.
     for at in 0..width {
         blobs.extend(order.iter().map(|&id| content.extra_bytes[id as usize * width + at]));
     }

@@ -98,8 +98,8 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Decodes values from `from` into `data`. `weights` and `models` must be those that [`QuantizedTensor::encode`]
-    /// used.
+    /// Decodes values from `from` into `data`. `weights` and `models` must equal those with which
+    /// [`QuantizedTensor::encode`] was called.
     pub(super) fn decode(
         &self,
         weights: &PredictorWeights<NEIGHBORS>,
@@ -115,14 +115,17 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Visits every place (row and column) of every channel in coding order. Sets each value in `data`:
-    /// - at a place that the field reads: to the first of the two numbers that `code` returns
-    /// - at a place in a stored row that the field never reads: to the mean of its neighbors
-    /// - in a row that is not stored: to the value of the nearest stored row
+    /// Computes a new value for every place (row and column) of every channel, in coding order, and writes it to
+    /// `data`. There are three cases:
+    /// - The field reads the place. The value is the restored value that `code` returns.
+    /// - The place is in a stored row, but the field never reads it. The value is the mean of four known neighbors:
+    ///   left, above, above left and above right.
+    /// - The place is in a row that is not stored. The value is that of the same column in the nearest stored row.
     ///
-    /// `code` encodes or decodes one value. Arguments: index of the place in its channel, value in `data`, known
-    /// neighbors, quantization grid. Results: restored value, and absolute prediction error in quantization steps.
-    /// Later places are predicted from both results.
+    /// `code` encodes or decodes one value:
+    /// - Arguments: index of the place in its channel, present value in `data`, known neighbors, quantization grid.
+    /// - Results: restored value, and absolute prediction error in quantization steps. Later places are predicted from
+    ///   the restored value. The error serves to estimate the errors of these predictions.
     #[inline(always)]
     fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;
@@ -138,7 +141,7 @@ impl QuantizedTensor<'_> {
             [&mut above2, &mut above, &mut sizes_above].into_iter().for_each(|line| line.fill(0.0));
             for row in self.stored.clone() {
                 let classes = self.row_classes(row);
-                // The places to the left of the first column repeat the value above it.
+                // The two places to the left of the first column get the value above the first column.
                 (here[0], here[1]) = (above[2], above[2]);
                 (sizes[0], sizes[1]) = (sizes_above[2], sizes_above[2]);
                 let out = &mut data[row * columns..][..columns];
@@ -165,7 +168,7 @@ impl QuantizedTensor<'_> {
                         *average = 0.875 * *average + 0.125 * off;
                     }
                 }
-                // The place to the right of the last column repeats its value.
+                // The place to the right of the last column gets the value of the last column.
                 (here[columns + 2], sizes[columns + 2]) = (here[columns + 1], sizes[columns + 1]);
                 std::mem::swap(&mut above2, &mut above);
                 std::mem::swap(&mut above, &mut here);

@@ -234,9 +234,9 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Passes `whole`, the full result of `stage`, on to the caller, except in a run that is limited to shard (part of
-    /// the stage) 1 of 1. This shard is the whole stage and such a run ends when its shard is done, so it fails with
-    /// [`Error::ShardDone`].
+    /// Returns `whole`, the full result of `stage`. Only a run that is limited to shard (part of the stage) 1 of 1
+    /// fails with [`Error::ShardDone`] instead: this shard is the whole stage, and a limited run ends when its shard is
+    /// done.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -246,17 +246,19 @@ impl Cache {
         }
     }
 
-    /// Decides into how many shards (parts) `stage` is divided, and returns this number n; 1 means that it is not
-    /// divided. To be called if the full result of `stage` is not stored. The caller then computes the shards that are
-    /// not stored, and joins all n.
+    /// Returns the number n of shards (parts) into which `stage` is divided; 1 means that it is not divided. To be
+    /// called if the full result of `stage` is not stored. The caller then computes the shards that are not stored, and
+    /// joins all n.
     ///
-    /// - Without a work folder, n is 1.
-    /// - Otherwise, if all shards of a division are stored, n is the number of its shards.
-    /// - Otherwise, if the run is not limited to a shard: n is the number of shards of the division of which the
-    ///   largest fraction is stored, or 1 if no shard is stored.
-    /// - Otherwise, if the run is limited to shard 1 of 1, n is 1.
-    /// - Otherwise the run is limited to one shard of several. Computes and stores the shard with `make` if `find` does
-    ///   not find it stored. Then returns the error [`Error::ShardDone`], which ends the run.
+    /// The work folder may hold shards of several divisions, which differ in the number of shards. The first of these
+    /// rules that applies decides:
+    /// 1. There is no work folder: n is 1.
+    /// 2. All shards of a division are stored: n is the number of its shards.
+    /// 3. The run is not limited to a shard: n is the number of shards of the division of which the largest fraction is
+    ///    stored. If no shard is stored, n is 1.
+    /// 4. The run is limited to shard 1 of 1: n is 1.
+    /// 5. The run is limited to one of several shards: computes and stores this shard with `make`, unless `find` finds
+    ///    it stored. Then returns the error [`Error::ShardDone`], which ends the run.
     fn divide<T>(
         &self,
         stage: &str,

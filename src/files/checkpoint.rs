@@ -412,7 +412,7 @@ impl Checkpoint {
         self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
     }
 
-    /// Reads the bytes of the storage `key`.
+    /// Reads the bytes of the storage (block of tensor values) `key`.
     ///
     /// # Errors
     /// Fails if the storage is missing or damaged.
@@ -427,8 +427,8 @@ impl Checkpoint {
         read_entry(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
     }
 
-    /// Reads the elements of a floating-point tensor as f32, the last axis fastest; `place` names it in messages. They
-    /// may be NaN or infinite.
+    /// Reads the elements of a floating-point tensor as f32, the last axis fastest; `place` names it in messages.
+    /// Elements may be NaN or infinite.
     ///
     /// # Errors
     /// Fails if values are damaged or need more memory than allowed.
@@ -477,7 +477,7 @@ pub(crate) enum CheckpointFile<'a> {
     Other,
 }
 
-/// Name of the pickle file in the archive.
+/// Name of the pickle file in the zip archive of a checkpoint.
 const PICKLE: &str = "data.pkl";
 
 /// Returns `name`, the path of a file in the archive, without its first folder. PyTorch calls this folder `archive` or
@@ -486,7 +486,8 @@ fn without_first_folder(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
 }
 
-/// Start of a file of the format that PyTorch before 1.6 saves: a pickle of PyTorch's magic number.
+/// Bytes 2 to 13 of a file in the format that PyTorch before 1.6 saves: the pickle of PyTorch's magic number, without
+/// the two bytes before it that state the pickle protocol.
 const LEGACY_MAGIC: &[u8] = b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19";
 
 /// Returns whether `head`, the first bytes of a file, belong to the format that PyTorch before 1.6 saves.
@@ -505,7 +506,7 @@ pub(crate) fn legacy_format(path: &Path) -> Error {
     .hint("convert it: python3 -c \"import torch; torch.save(torch.load('OLD', map_location='cpu'), 'NEW')\"")
 }
 
-/// Text for the location in the file ("list of files") in errors about an invalid list of files of the zip archive.
+/// Name that error messages use for the list of files of the zip archive, if the error is in this list.
 const LIST: &str = "list of files";
 
 /// Returns whether the text "big" is at byte `at` of the file. PyTorch stores it if the values are big-endian.

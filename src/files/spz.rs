@@ -35,7 +35,8 @@ pub const MAGIC: u32 = 0x5053_474e;
 const HEADER_BYTES_4: usize = 32;
 /// zstd compression level of files of version 4, the same as in the format's own library.
 const ZSTD_LEVEL: i32 = 12;
-/// Largest magnitude of a stored position, in units of the last bit (24 bits, signed).
+/// Largest magnitude of a coordinate as it is stored: a 24-bit signed integer, in units of 2^−(fractional bits) scene
+/// units.
 const MAX_FIXED: f64 = 8_388_607.0;
 /// Maximum number of fractional bits of positions; more bits would only store rounding noise of f32.
 const MAX_FRACTION_BITS: i32 = 20;
@@ -54,15 +55,20 @@ pub enum SpzVersion {
 /// Errors of the values that an `.spz` file stores.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpzErrors {
-    /// Largest error of a position, in scene units.
+    /// Largest difference between a stored and an original coordinate of a position, in scene units.
     pub position: f64,
-    /// Number of Gaussians with a scale above the maximum that the format can store. The file stores the maximum, which
-    /// is more than 1/10 too small. This is allowed, because it is still at least ten times as large as the scene.
+    /// Number of Gaussians with a scale that is stored much too small. A scale counts as such if both conditions hold:
+    /// - The scale is above the maximum that the format can store. The file then stores this maximum.
+    /// - The maximum is smaller than the scale by more than 1/10 of the scale.
+    ///
+    /// Such a scale is allowed, because the maximum is still at least ten times as large as the scene. If the maximum
+    /// is smaller than that, [`write_spz`] fails.
     pub reduced_scales: usize,
 }
 
 impl SpzErrors {
-    /// Returns notes for the user about the errors.
+    /// Returns notes for the user: the largest position error, and the number of Gaussians with a reduced scale, if
+    /// any.
     pub fn notes(&self) -> Vec<String> {
         let mut notes = vec![format!("maximum position error: {:.2e} scene units", self.position)];
         if self.reduced_scales > 0 {
@@ -182,7 +188,8 @@ fn scale_of_byte(byte: u8) -> f64 {
     (f64::from(byte) / 16.0 - 10.0).exp()
 }
 
-/// Returns the coding errors of an `.spz` file of `state` whose positions are stored in units of `unit`.
+/// Returns the errors (original minus stored value) of an `.spz` file of the Gaussians `state`. `unit` is the unit in
+/// which positions are stored, in scene units.
 ///
 /// # Errors
 /// Fails if an error exceeds its bound in [`accuracy`](super::accuracy).

@@ -91,10 +91,12 @@ impl CurveForm {
 
 /// Width of an overlapping window, divided by the distance between the centers of neighboring windows.
 const WIDTH_PER_INTERVAL: f64 = 0.75;
-/// Maximum number of iterations that distribute the optical depth among overlapping curves.
+/// Maximum number of iterations in [`overlapping_curves`], which distribute the optical depth −ln(1 − opacity) of a
+/// Gaussian among the curves that replace it.
 const MAX_UPDATES: usize = 60;
-/// Limit of convergence of the iterations that distribute the optical depth. They end once no optical depth changes by
-/// more than this fraction in one iteration. Optical depths below this value are ignored in this test.
+/// Tolerance of the iterations in [`overlapping_curves`], which distribute the optical depth −ln(1 − opacity) of a
+/// Gaussian among the curves that replace it. The iterations end once no curve's optical depth changes by more than
+/// this fraction in one iteration. Curves with an optical depth below this value are ignored in this test.
 const CONVERGED: f64 = 1e-3;
 /// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 const MAX_OPACITY: f64 = 0.999;

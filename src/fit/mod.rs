@@ -17,8 +17,8 @@ pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
 /// Largest errors that a fit may have at any frame in which the Gaussian is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tolerance {
-    /// Largest allowed distance between the positions of the fit and of the Gaussian, in units of the middle one of the
-    /// Gaussian's three scales.
+    /// Largest allowed distance between the positions of the fit and of the Gaussian, in units of the Gaussian's middle
+    /// scale (the middle one of its three scales).
     pub position: f64,
     /// Largest allowed angle between the rotations of the fit and of the Gaussian, radians. Ignored for a nearly round
     /// Gaussian, whose log scales all differ by less than 0.1.
@@ -37,7 +37,7 @@ pub struct Tolerance {
 
 impl Tolerance {
     /// Tolerances of the compact fit by [`curved`], which takes few curves: for example, a Gaussian may be off by half
-    /// of its middle scale.
+    /// of its middle scale (the middle one of its three scales).
     pub const COMPACT: Tolerance =
         Tolerance { position: 0.5, rotation: 0.3, log_scale: 0.2, opacity: 0.06, sh: 0.2, full_opacity: 1.0 / 3.0 };
 
@@ -56,18 +56,18 @@ impl Default for Tolerance {
     }
 }
 
-/// Errors beyond which a fitted Gaussian counts as far off. First: error of its position, in units of its middle scale.
-/// Second: error of its opacity.
+/// Errors beyond which a fitted Gaussian counts as far off. First: error of its position, in units of its middle scale
+/// (the middle one of its three scales). Second: error of its opacity.
 const FAR: [f64; 2] = [1.0, 0.1];
 
-/// Errors of fitted motions (curves, or pieces of linear motion) compared with the original states of the Gaussians,
-/// over all Gaussians and the frames in which they are visible.
+/// Errors of fitted motions (curves, or pieces of linear motion) compared with the original states of the Gaussians.
+/// They are collected over all Gaussians, and over the frames in which the Gaussian or its fit is visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct FitError {
-    /// Number of compared states (Gaussians × visible frames).
+    /// Number of compared states. A state is one Gaussian at one frame in which it or its fit is visible.
     pub states: u64,
-    /// Sum, over all compared states, of the squared distance between the positions of the fit and of the Gaussian, in
-    /// units of the Gaussian's middle scale squared.
+    /// Sum, over all compared states, of the squared distance between the positions of the fit and of the Gaussian.
+    /// Distances are in units of the Gaussian's middle scale (the middle one of its three scales).
     squares: f64,
     /// Sum, over all compared states, of the squared difference between the opacity of the fit and that of the
     /// Gaussian.
@@ -77,7 +77,7 @@ pub struct FitError {
     /// Sum of the Gaussian's opacity over the compared states in which the fit is off by more than [`FAR`].
     far: f64,
     /// Largest distance, over all compared states, between the positions of the fit and of the Gaussian, in units of
-    /// the Gaussian's middle scale.
+    /// the Gaussian's middle scale (the middle one of its three scales).
     pub position: f64,
     /// Largest difference, over all compared states, between the opacities of the fit and of the Gaussian.
     pub opacity: f64,
@@ -85,8 +85,9 @@ pub struct FitError {
 
 impl FitError {
     /// Adds one compared state: one Gaussian at one frame. `position`: distance between the positions of the fit and of
-    /// the Gaussian, in units of the Gaussian's middle scale. `opacity`: difference between the opacities of the fit
-    /// and of the Gaussian. `visible`: opacity of the Gaussian, its weight in [`FitError::far_off_fraction`].
+    /// the Gaussian, in units of the Gaussian's middle scale (the middle one of its three scales). `opacity`:
+    /// difference between the opacities of the fit and of the Gaussian. `visible`: opacity of the Gaussian, its weight
+    /// in [`FitError::far_off_fraction`].
     pub(crate) fn add(&mut self, position: f64, opacity: f64, visible: f64) {
         self.visible += visible;
         self.far += if position > FAR[0] || opacity.abs() > FAR[1] { visible } else { 0.0 };
@@ -112,14 +113,15 @@ impl FitError {
     }
 
     /// Returns the root mean square distance between the positions of the fit and of the Gaussian, over all compared
-    /// states, in units of the Gaussian's middle scale.
+    /// states. Distances are in units of the Gaussian's middle scale (the middle one of its three scales).
     pub fn rms(&self) -> f64 {
         (self.squares / self.states.max(1) as f64).sqrt()
     }
 
     /// Returns the fraction of the compared states, weighted by the opacity of the Gaussian, in which the fit is far
-    /// off. A fit is far off if its position is wrong by more than the Gaussian's middle scale, or its opacity by more
-    /// than 0.1. Because of the weight, faint Gaussians hardly count in this fraction, unlike in the other errors.
+    /// off. A fit is far off if its position is wrong by more than the Gaussian's middle scale (the middle one of its
+    /// three scales), or its opacity by more than 0.1. Because of the weight, faint Gaussians hardly count in this
+    /// fraction, unlike in the other errors.
     pub fn far_off_fraction(&self) -> f64 {
         self.far / self.visible.max(f64::MIN_POSITIVE)
     }

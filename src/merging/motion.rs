@@ -13,24 +13,27 @@ use rayon::prelude::*;
 use super::appearance::COSINE_EPSILON;
 use crate::recipe::{self, MotionParams, MotionSimilarity};
 
-/// Bytes of memory for one pair during the measurement.
+/// Bytes of memory that [`PairMotion`] takes for each pair of nodes (Gaussians or merged groups) whose motion it
+/// measures.
 pub const PAIR_BYTES: usize = size_of::<NodePair>();
-/// Bytes of memory for one node (Gaussian or merged group) during the measurement.
+/// Bytes of memory that [`PairMotion`] takes for each node (Gaussian or merged group) whose motion it follows.
 pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 
-/// Measured motion of two Gaussians relative to each other. Velocities are steps a = x(t) − x(t−1) between consecutive
-/// frames, whatever the time between them, because the noise level they are compared with is also one per step.
+/// Measured motion of two Gaussians relative to each other. A velocity is a step a = x(t) − x(t−1) between consecutive
+/// frames. It is not divided by the time between the frames, because the noise level with which it is compared is also
+/// that of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
     /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the steps of the two Gaussians from the previous
     /// frame to this frame. The cosine is 0 if a or b is zero. The mean is over frames in which both Gaussians are
     /// alive (opacity ≥ alpha_min):
-    /// - with `MotionParams::Runs`, only those in whose previous frame both are alive, too;
-    /// - with `MotionParams::Literal`, all of them; the first frame of the sequence, which has no step, counts as 0.
+    /// - With `MotionParams::Runs`, such a frame counts only if both are alive in the previous frame, too.
+    /// - With `MotionParams::Literal`, every such frame counts. The first frame of the sequence has no step; its cosine
+    ///   is 0.
     pub cosine: f64,
     /// Σ a·b over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
     pub dot: f64,
-    /// Σ ‖a‖² + ‖b‖² over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
+    /// Σ (‖a‖² + ‖b‖²) over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
     pub squares: f64,
     /// Number n of steps (from one frame to the next) in the sums `dot` and `squares`.
     pub steps: u32,
@@ -38,9 +41,10 @@ pub struct PairMeasure {
     pub common: u32,
     /// Number of frames in which at least one of the Gaussians is alive (opacity ≥ alpha_min).
     pub union: u32,
-    /// Largest measured change of the offset between the two Gaussians (difference of their positions) from its value
-    /// at the reference frame. In scene units, over the frames in which both Gaussians are alive (opacity ≥ alpha_min).
-    /// A proxy (Gaussian that replaces both) is built from the offset at the reference frame.
+    /// Largest change of the offset between the two Gaussians (difference of their positions) from its value at the
+    /// reference frame. In scene units, over the frames in which both Gaussians are alive (opacity ≥ alpha_min). A
+    /// proxy (Gaussian that replaces both) is built from the offset at the reference frame, so it fits other frames
+    /// only if the change is small.
     pub drift: f64,
 }
 
@@ -137,10 +141,10 @@ pub struct PairMotion {
 }
 
 impl PairMotion {
-    /// Starts to measure how alike the two nodes (Gaussians or merged groups) of each pair move: the [`PairMeasure`] of
-    /// the pair. `pairs` yields the indices of the two nodes of each pair. `reference` yields the position of every
-    /// node at the reference frame. Frames are added with [`PairMotion::add_frame`]. `motion` selects the steps (from
-    /// one frame to the next) that count:
+    /// Starts to measure the motion of each pair of nodes (Gaussians or merged groups), for its [`PairMeasure`].
+    /// `pairs` yields the indices of the two nodes of each pair. `reference` yields the position of every node at the
+    /// reference frame. Frames are added with [`PairMotion::add_frame`]. `motion` selects the steps (from one frame to
+    /// the next) that count:
     /// - `Literal`: all steps that end in a frame in which both nodes are alive (opacity ≥ alpha_min);
     /// - `Runs`: only steps that begin and end in such a frame.
     pub fn new(

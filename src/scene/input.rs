@@ -34,7 +34,8 @@ pub struct InputOptions {
     pub cameras: Option<PathBuf>,
     /// Image width and height in pixels, for cameras whose file does not state them.
     pub size: Option<(u32, u32)>,
-    /// Source of the times of views: the camera file, the names of the images, a table, or none.
+    /// Source of the times of views: the camera file or, if it states no times, the names of the images, a table, or
+    /// none.
     pub times: TimesSource,
     /// Split (training, validation or test) whose views are used; `None`: the views of all splits.
     pub split: Option<Split>,

@@ -17,17 +17,17 @@ const VIEW_NUMBER: u32 = u32::MAX;
 const CAMERAS_PER_VIEW: usize = 8;
 /// Maximum number of different cameras outside the rig.
 const MAX_CAMERAS: usize = 64;
-/// Smallest angle between the direction of a camera and the nearest direction of the rig at which the camera counts as
-/// outside the rig, radians (2°).
+/// Minimum angle at which a camera counts as outside the rig, radians (2°): the angle between the direction of the
+/// camera and the nearest direction in the cone of the rig ([`RigCone`]).
 pub const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
 /// Maximum number of random cameras that are tried for each wanted camera outside the rig.
 const TRIES: usize = 64;
-/// Maximum number of iterations of the search for the direction of a cone that is nearest to a given direction
-/// ([`RigCone::angle`]).
+/// Maximum number of iterations in [`RigCone::angle`], which searches a cone for the direction nearest to a given one.
+/// Each iteration adds the direction of one camera to a weighted sum that approaches the given direction.
 const MAX_DIRECTIONS: usize = 64;
-/// Tolerance of the search for the direction of a cone that is nearest to a given direction ([`RigCone::angle`]). It is
-/// used in two tests. The remainder is the given direction minus the nearest point of the cone found so far.
-/// - The search ends if no direction of the cone has a dot product with the remainder above this value.
+/// Tolerance of [`RigCone::angle`], which searches a cone for the direction nearest to a given one. It has two uses:
+/// - The search ends if no direction of the cone has a dot product above this value with the remainder. The remainder
+///   is the given direction minus the nearest point of the cone found so far.
 /// - Vectors count as linearly dependent if the absolute value of their determinant is at most this value.
 const EXACT_ENOUGH: f64 = 1e-12;
 /// Tolerance for the faces of a cone, with two uses:
@@ -116,7 +116,8 @@ impl RigCone {
 fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(used, direction) else { return false };
-        // Fraction of the way from the present weights to the free ones at which the first weight becomes 0.
+        // Fraction of the way from the present weights to the weights of any sign (`free`) at which the first weight
+        // becomes 0.
         let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| (free <= 0.0).then(|| weight / (weight - free));
         let step = used.iter().zip(&free).filter_map(limit).fold(1.0, f64::min);
         used.iter_mut().zip(&free).for_each(|((_, weight), free)| *weight += step * (free - *weight));

@@ -1,22 +1,28 @@
 //! Removes apparent motion that is only the rounding of positions to f32.
 //!
-//! A resting Gaussian whose positions are rounded to f32 has a trajectory magnitude D ≈ 0.71 ulp and a curvature κ ≈
-//! 1.2 ulp, where one ulp is the distance between neighboring f32 values. All coordinates of a scene share one offset,
-//! so the ulp of the largest coordinate is used for every Gaussian.
+//! The trajectory magnitude D states how far a Gaussian moves per frame, the curvature κ how much its motion turns or
+//! accelerates. Rounding moves even a resting Gaussian: D ≈ 0.71 ulp and κ ≈ 1.2 ulp, where one ulp is the distance
+//! between neighboring f32 values. All coordinates of a scene share one offset, so the ulp of the largest coordinate is
+//! used for every Gaussian.
 
 use crate::model::{AnomalyFlags, StatisticRows};
 
-/// Trajectory magnitude D below which motion counts as rounding noise, in ulp of the scene's largest coordinate.
+/// Trajectory magnitude D (how far a Gaussian moves per frame) below which the motion counts as rounding noise. In ulp
+/// (distance between neighboring f32 values) of the scene's largest coordinate.
 const D_NOISE_ULP: f64 = 2.0;
-/// Curvature κ below which motion counts as rounding noise, in ulp of the scene's largest coordinate.
+/// Curvature κ (how much the motion of a Gaussian turns or accelerates) below which it counts as rounding noise. In ulp
+/// (distance between neighboring f32 values) of the scene's largest coordinate.
 const KAPPA_NOISE_ULP: f64 = 4.0;
 
-/// Numbers of Gaussians whose motion was set to 0 because it was rounding noise.
+/// Numbers of Gaussians with motion statistics that were replaced by 0, because they were rounding noise of the
+/// positions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SnapCounts {
-    /// Number of Gaussians whose trajectory magnitude D was set to 0.
+    /// Number of Gaussians whose trajectory magnitude D (how far they move per frame) was rounding noise and was set to
+    /// 0.
     pub d: usize,
-    /// Number of Gaussians whose curvature κ was set to 0.
+    /// Number of Gaussians whose curvature κ (how much their motion turns or accelerates) was rounding noise and was
+    /// set to 0.
     pub kappa: usize,
 }
 
@@ -27,9 +33,10 @@ pub fn ulp(x: f32) -> f64 {
     2f64.powi(exponent.max(1) - 127 - 23)
 }
 
-/// Sets every trajectory magnitude D below 2 ulp and every curvature κ below 4 ulp of `largest_coordinate` to exactly
-/// 0. Marks each Gaussian whose D or κ changes with the flag `SNAPPED_D` or `SNAPPED_KAPPA`. Returns how many values of
-/// D and of κ were set to 0.
+/// Sets every trajectory magnitude D below 2 ulp and every curvature κ below 4 ulp to exactly 0, because such small
+/// motion is rounding noise. One ulp is the distance between neighboring f32 values at `largest_coordinate`. Marks each
+/// Gaussian whose D or κ changes with the flag `SNAPPED_D` or `SNAPPED_KAPPA`. Returns how many values of D and of κ
+/// were set to 0.
 ///
 /// `largest_coordinate` is the largest |coordinate| of the whole scene, at least 0. Values that are 0 already are
 /// neither flagged nor counted.

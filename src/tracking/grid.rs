@@ -1,7 +1,7 @@
 //! Grid of the Gaussians of a frame, to find neighbors of similar size. There is one grid of cells per octave (factor
 //! of two) of sizes; all of them share one hash table.
 //!
-//! Memory: 72 bytes per Gaussian, and 4 bytes per hash bucket, of which there are up to four per Gaussian.
+//! Memory: 88 bytes per Gaussian, and 4 bytes per hash bucket, of which there are up to four per Gaussian.
 
 use std::ops::RangeInclusive;
 

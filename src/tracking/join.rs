@@ -11,13 +11,14 @@ use super::linker::Linker;
 use super::track::{Candidate, Candidates, MAX_CANDIDATES, NONE, OpenTrack, Round};
 use crate::model::{AttributeValues, Gaussians};
 
-/// Rules for joining two tracks (Gaussians followed through frames): `ALIKE` for tracks that may be one Gaussian;
-/// `CLOSE`, which is stricter, for tracks that look the same. Two tracks may be joined if the cost of their pair is at
-/// most 1. In this cost, `reach` scales the distance and `strictness` the difference in appearance.
+/// Rules for joining two tracks (Gaussians followed through frames). `ALIKE` accepts tracks that may be one Gaussian.
+/// `CLOSE` is stricter: it accepts only tracks that look the same. Two tracks may be joined if the cost of their pair
+/// is at most 1. In this cost, `reach` scales the distance and `strictness` the difference in appearance.
 const ALIKE: Round = Round { reach: 4.0, strictness: 1.0 / 16.0, includes_missing: true };
 const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, includes_missing: true };
-/// Largest ratio of the sizes of joined tracks (Gaussians followed through frames), as a natural log: ln √2. The grid
-/// that finds similar Gaussians finds no other sizes.
+/// Maximum ratio of the sizes of two tracks (Gaussians followed through frames) that may be joined, as a natural
+/// logarithm: ln √2. The size is the root mean square of the three scales. The maximum is √2, because the search for
+/// similar Gaussians ([`CellGrid::for_each_near`]) is only certain to find sizes up to this ratio.
 const MAX_LN_SIZE_RATIO: f32 = std::f32::consts::LN_2 / 2.0;
 /// Largest count of shared frames with which two tracks (Gaussians followed through frames) may still be joined. A
 /// frame in which both tracks are present raises the count by 1; a frame in which one of them is missing lowers it by
@@ -40,7 +41,7 @@ struct JoinedTracks {
     /// Pairs of tracks that are not joined yet and may still be. Sorted by the number of the later track, then by cost
     /// (distance and difference in appearance).
     pairs: Vec<TrackPair>,
-    /// For each track the number of the earlier track that it is joined to; `NONE` if there is none.
+    /// For each track, the number of the earlier track that it is joined to and continues; `NONE` if there is none.
     predecessor: Vec<u32>,
     /// For each track, whether a later track that continues it has been joined to it.
     has_successor: Vec<bool>,
@@ -57,7 +58,7 @@ struct TrackPair {
     shared_frames: u8,
     /// Whether the two tracks satisfied the rule `CLOSE` in every frame in which both were present.
     are_close: bool,
-    /// Whether the earlier track has ended.
+    /// Whether the earlier track has ended, so that the later track can be joined to it.
     has_ended: bool,
 }
 

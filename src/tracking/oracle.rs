@@ -212,8 +212,9 @@ impl SlowLinker {
         self.extend_tracks(&all, &gaussian_of)
     }
 
-    /// Advances the open tracks (Gaussians followed through frames) by a frame and returns the number of the track of
-    /// every Gaussian. `gaussian_of` maps each linked track to its Gaussian; all other Gaussians begin tracks.
+    /// Advances the open tracks (Gaussians followed through frames) by a frame, whose Gaussians are `all`. Returns the
+    /// number of the track of every Gaussian. `gaussian_of` maps each linked track to its Gaussian; all other Gaussians
+    /// begin tracks.
     fn extend_tracks(&mut self, all: &[SeenGaussian], gaussian_of: &BTreeMap<usize, usize>) -> Vec<u32> {
         let mut numbers = vec![u32::MAX; all.len()];
         for (a, track) in self.tracks.iter_mut().enumerate() {
@@ -258,9 +259,9 @@ impl SlowLinker {
 /// has a Gaussian: frame → this Gaussian.
 pub(super) type History = Vec<BTreeMap<usize, SeenGaussian>>;
 
-/// Returns the position of a track (Gaussian followed through frames) at `frame`, observed or extrapolated, in scene
-/// units, and the number of frames since the track was last seen. `frame` must not be before the first frame of the
-/// track.
+/// Returns the position of a track (Gaussian followed through frames) at `frame` in scene units, and the number of
+/// frames since the last frame in which the track has a Gaussian. If this number is not 0, the position is
+/// extrapolated. `frame` must not be before the first frame of the track.
 fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3], usize) {
     let seen: Vec<(&usize, &SeenGaussian)> = track.range(..=frame).collect();
     let mut velocity: Option<[f64; 3]> = None;
@@ -279,7 +280,8 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
 ///
 /// - Key: number of the later track, then the bits of the cost of the pair.
 /// - Value: number of the earlier track; count of shared frames (a frame with both tracks adds 1, a frame without one
-///   of them subtracts 1, down to 0); whether both tracks are close; whether the earlier track has ended.
+///   of them subtracts 1, down to 0); whether the two tracks look the same (rule *close*); whether the earlier track
+///   has ended (has had no Gaussian for more than [`MAX_GAP_FRAMES`] frames).
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
 /// Joins tracks (Gaussians followed through frames) that belong to one Gaussian: one track ends where and when a
@@ -367,11 +369,17 @@ pub(super) fn slow_joined_tracks(
     joined
 }
 
-/// Joins pairs of tracks (Gaussians followed through frames) that seem to be one Gaussian, until `pairs` has no
-/// joinable pair left. A pair has an earlier and a later track (the one that begins later), and a cost (distance and
-/// difference in appearance; lower is more alike). A later track is joined only by its pair of lowest cost, and only if
-/// the earlier track of this pair has ended. The joins are recorded: `predecessor` holds for each track the earlier
-/// track that it continues, and `has_successor` whether a later track continues it.
+/// Joins tracks (Gaussians followed through frames) that seem to be one Gaussian. Each of `pairs` has an earlier track,
+/// a later track that may continue it, and a cost (distance and difference in appearance). The steps are:
+/// 1. For each later track, select its pair of lowest cost. Drop the selected pairs whose earlier track has not ended.
+/// 2. Join the tracks of the selected pairs in the order of cost. Skip a pair if its earlier track is already
+///    continued.
+/// 3. Remove pairs that cannot be joined any more: the later track is joined, or the earlier track has ended and is
+///    continued by another track.
+/// 4. Repeat from step 1, until it selects no pair.
+///
+/// The joins are recorded: `predecessor` holds for each track the earlier track that it continues, and `has_successor`
+/// whether a later track continues it.
 fn join_ended(pairs: &mut TrackPairs, predecessor: &mut [Option<usize>], has_successor: &mut [bool]) {
     loop {
         let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();

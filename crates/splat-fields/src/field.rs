@@ -205,10 +205,12 @@ impl Field {
         }
     }
 
-    /// Evaluates the field at `time` for the Gaussians of a prepared block. Writes to `out` the deltas of the
-    /// attributes in `want` that the field changes, and the mask of each Gaussian. The mask is a factor on the stored
-    /// attributes, except the rotation, to which the deltas are then added ([`Deltas`]). Deltas of other attributes in
-    /// `out` stay unchanged.
+    /// Evaluates the field at `time` for the Gaussians of a prepared block. Writes two results to `out`:
+    /// - the deltas of those attributes in `want` that the field changes; deltas of other attributes in `out` stay
+    ///   unchanged;
+    /// - the mask of each Gaussian, a factor on its stored attributes except the rotation.
+    ///
+    /// [`Deltas::apply`] computes the attributes at `time` from these results: stored value times mask, plus delta.
     ///
     /// `prepared` is what [`Field::prepare`] returned for the block. `time` is passed to the field unscaled; the
     /// feature planes clamp it to [−1, 1].

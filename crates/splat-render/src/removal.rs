@@ -65,7 +65,7 @@ impl RemovalError {
         ids
     }
 
-    /// Adds `other`, the removal errors of the same Gaussians in other views.
+    /// Adds the removal errors in `other`, which come from other views of the same Gaussians, to those in `self`.
     ///
     /// # Panics
     /// Panics if the numbers of Gaussians differ.
@@ -74,8 +74,8 @@ impl RemovalError {
         self.sum.iter_mut().zip(&other.sum).for_each(|(sum, other)| *sum = sum.saturating_add(*other));
     }
 
-    /// Adds the removal errors of `other` to some of the Gaussians: the error of Gaussian k of `other` is added to
-    /// Gaussian `rows[k]` of `self`.
+    /// Adds the removal errors in `other`, which come from a subset of the Gaussians. The error of Gaussian k of
+    /// `other` is added to that of Gaussian `rows[k]` of `self`.
     pub fn merge_rows(&mut self, rows: &[u32], other: &RemovalError) {
         for (&row, other) in rows.iter().zip(&other.sum) {
             let sum = &mut self.sum[row as usize];
@@ -83,7 +83,8 @@ impl RemovalError {
         }
     }
 
-    /// Adds `error`, the removal error of Gaussian `i` in one tile of a view.
+    /// Adds `error` to the sum of Gaussian `i`. `error` is the squared error that the removal of the Gaussian would
+    /// cause in one tile of a view. It is rounded to a multiple of [`RemovalError::SUM_UNIT`].
     pub(super) fn add(&mut self, i: usize, error: f32) {
         let units = (f64::from(error) * (1.0 / Self::SUM_UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);

@@ -120,10 +120,13 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
     }
 }
 
-/// Completes or reverts interrupted moves of results to the name of `target`. The caller holds the [`PublishLock`].
+/// Repairs interrupted moves of results to the name of `target`: completes each move, or gives the earlier result its
+/// name back. Warns the user about a move for which this fails. The caller holds the [`PublishLock`].
 ///
-/// `supersedes` is true if the caller is about to move its own result to this name. An interrupted move that cannot be
-/// completed is then discarded, so that no later run completes it and thereby overwrites the caller's result.
+/// `supersedes` states what happens to the journal (list of files still to be moved) after such a failure:
+/// - If true, it is deleted. The caller is about to move its own result to this name, and no later run may overwrite
+///   that result by completing the old move.
+/// - If false, it stays, and a later run tries again.
 pub(super) fn repair(target: &Path, supersedes: bool) {
     let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
@@ -158,10 +161,13 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
 /// Completes or reverts an interrupted move of a result to `target`. The result lies in the workspace `folder` (hidden
 /// folder of the killed run), which is a subfolder of `parent`. The caller holds the [`PublishLock`].
 ///
-/// - If the workspace holds a journal (list of the files of the result), these files are renamed to their final names.
-/// - If it holds an earlier result folder and nothing has the name of `target`, this folder gets its name back.
-/// - If it holds an earlier result folder and the new one is in place, the foreign entries of the earlier folder (those
-///   that its summary does not list) are moved into the new one, and the rest is discarded.
+/// - If the workspace holds a journal (list of the files of the result), the move is completed: these files are renamed
+///   to their final names.
+/// - If it holds an earlier result folder and nothing has the name of `target`, the move is reverted: the earlier
+///   folder gets its name back.
+/// - If it holds an earlier result folder and the new one is in place, the move is completed: the foreign entries of
+///   the earlier folder (those that its summary does not list) are moved into the new one. The earlier folder with its
+///   other entries is discarded.
 /// - If foreign entries cannot be moved, for example because another user owns a folder, the earlier folder stays
 ///   beside the result under its name with `.kept` appended.
 pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {

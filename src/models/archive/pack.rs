@@ -61,24 +61,24 @@ impl FileContent<'_> {
     }
 }
 
-/// Place in the content of an archive where a value of each Gaussian is stored.
+/// Location of one value of each Gaussian in the content of an archive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Target {
     /// Component of an attribute: the attribute, and the index of the component.
     Attribute(Attributes, usize),
     /// Component of the column with this name. Columns hold values of Gaussians that belong to no attribute.
     Column(String),
-    /// No place: the value is stored exactly, as bytes.
+    /// Extra bytes ([`ArchiveContent::extra_bytes`]): the bytes of the value are stored unchanged, not quantized.
     Bytes,
-    /// No place: the value is restored as zero, because no evaluation reads it.
+    /// Nowhere: the value is not stored, because no evaluation of the model reads it. It is restored as zero.
     Zeros,
 }
 
 /// Field of the rows of a file, where each row holds the values of one Gaussian.
 #[derive(Debug, Clone)]
 struct RowField {
-    /// Variant of [`Field`] that describes the field in an archive. Its argument is the index of a plane (scalar
-    /// component of all Gaussians), or a number of bytes.
+    /// Constructor of the [`Field`] that describes this field in an archive. Its argument is the index of a plane
+    /// (scalar component of all Gaussians), or a number of bytes.
     to_field: fn(usize) -> Field,
     /// Number of bytes of the field in each row.
     bytes: usize,

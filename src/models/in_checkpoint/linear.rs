@@ -6,8 +6,8 @@
 //!   This is exact: the proxy is at the weighted mean of its members at every time.
 //! - Temporal window: has the mean and the variance in time of the members' windows, each of which counts with its
 //!   weight times its duration.
-//! - Shape and opacity: fitted by least squares to the moment matches of the members at sampled frames. The moment
-//!   match is the Gaussian with the mean and covariance of their mixture (method.md, section 5.6).
+//! - Shape and opacity: fitted by least squares to one Gaussian at each sampled frame. It has the mean and covariance
+//!   of the mixture of the members, and is called their moment match (method.md, section 5.6).
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -17,8 +17,7 @@ use crate::passes::{GAUSSIANS_PER_BLOCK, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum number of frames at which proxies (Gaussians that replace merged ones) are compared with the merged
-/// Gaussians.
+/// Maximum number of frames at which proxies (Gaussians that replace merged ones) are fitted to the merged Gaussians.
 const SAMPLED_FRAMES: usize = 48;
 /// Minimum product of opacity and temporal window that a proxy (Gaussian that replaces merged ones) must have at a
 /// frame; frames with a smaller product are not used for matching.
@@ -74,8 +73,8 @@ pub(in crate::models) struct Matched {
     pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
-/// State that one proxy (Gaussian that replaces merged ones) should have at one frame: the moment match of its members
-/// (the merged Gaussians), that is, the Gaussian with the mean and covariance of their mixture.
+/// Target state of one proxy (Gaussian that replaces merged ones) at one frame. It is a Gaussian with the mean and
+/// covariance of the mixture of the merged Gaussians, which is called their moment match.
 pub(in crate::models) struct ProxyAtFrame<'a> {
     /// Index of the proxy's cluster.
     pub(in crate::models) proxy: usize,
@@ -83,24 +82,24 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) line: &'a LinearPath,
     /// Time stamp of the frame.
     pub(in crate::models) time: f64,
-    /// Weight of the frame: window of the proxy times opacity of the moment match (see [`ProxyAtFrame`]).
+    /// Weight of the frame: value of the proxy's temporal window, times opacity of the target state of the proxy.
     pub(in crate::models) weight: f64,
-    /// States of a block of proxies (Gaussians that replace merged ones) at this frame: the moment matches of their
-    /// members (see [`ProxyAtFrame`]).
+    /// Target states of a block of proxies (Gaussians that replace merged ones) at this frame, one row per proxy. Each
+    /// has the mean and covariance of the mixture of the Gaussians that its proxy replaces.
     pub(in crate::models) state: &'a Gaussians,
-    /// Row of this proxy in `state`.
+    /// Index in `state` of the row with the target state of this proxy.
     pub(in crate::models) row: usize,
 }
 
 /// Computes the path, temporal window and shape of one proxy (Gaussian that replaces merged ones) for each of
-/// `clusters`. Each model format with linear motion converts them to its own stored parameters. At sampled frames, a
-/// proxy is compared with the moment match of its members (merged Gaussians): the Gaussian with the mean and covariance
-/// of their mixture.
+/// `clusters`. Each model format with linear motion converts them to its own stored parameters. At every sampled frame,
+/// a proxy has a target state: the Gaussian with the mean and covariance of the mixture of its members (the merged
+/// Gaussians). The shape and opacity of the proxy are fitted to its target states.
 ///
 /// - `line_of(id)` returns the path and window of the member `id`.
 /// - `window(line, time)` returns the value of the window of `line` at `time`.
-/// - `visit` is called with the moment match for each proxy, at each sampled frame at which the proxy is visible. The
-///   moment match has the attributes `wanted`, and always rotation, scale and opacity.
+/// - `visit` is called with the target state of each proxy, at each sampled frame at which the proxy is visible. The
+///   target state has the attributes `wanted`, and always rotation, scale and opacity.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -145,7 +144,7 @@ pub(in crate::models) fn match_proxies(
 
 /// Sums over the sampled frames of one proxy (Gaussian that replaces merged ones), from which its opacity and
 /// covariance are computed. At each frame, m is the value of the proxy's temporal window and α the opacity of its
-/// moment match (see [`ProxyAtFrame`]).
+/// target state (see [`ProxyAtFrame`]).
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
     /// Sum over the frames of m·α, the window times the opacity.
@@ -157,9 +156,9 @@ struct FrameSums {
 }
 
 impl FrameSums {
-    /// Adds one frame to the sums. Row `row` of `state` is the moment match of the merged Gaussians at this frame (the
-    /// Gaussian with the mean and covariance of their mixture), `m` is the value of the temporal window of the proxy
-    /// (Gaussian that replaces them), and `alpha` the opacity of the moment match.
+    /// Adds one frame to the sums. Row `row` of `state` is the target state of the proxy (Gaussian that replaces merged
+    /// ones) at this frame: the Gaussian with the mean and covariance of the mixture of the merged Gaussians. `m` is
+    /// the value of the proxy's temporal window, and `alpha` the opacity of the target state.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;

@@ -16,7 +16,7 @@ use crate::models::trajectories::state_bytes;
 /// Meaning of one value in a tensor's row (the values of one Gaussian).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::models) enum RowElement {
-    /// Component of an attribute.
+    /// Component of an attribute: the attribute, and the index of the component in it.
     Of(Attributes, usize),
     /// Parameter with this index in [`StoredParams::format_specific`], which only this model format has.
     Own(usize),
@@ -48,12 +48,12 @@ impl RowElement {
     }
 }
 
-/// Tensor whose rows hold parameters of Gaussians.
+/// Tensor whose rows hold parameters of Gaussians: row i holds those of Gaussian i.
 #[derive(Debug)]
 struct Param {
     name: String,
     tensor: TensorView,
-    /// Meaning of each value of a row, in order.
+    /// Meaning of each value in a row of the tensor, in order. A row holds the values of one Gaussian.
     planes: Vec<RowElement>,
 }
 
@@ -64,16 +64,16 @@ pub(in crate::models) struct RowTensors {
     /// Number of Gaussians.
     count: usize,
     params: Vec<Param>,
-    /// Tensors that only the training reads.
+    /// Tensors that only the training reads, such as the state of the optimizer. They have one row per Gaussian, too.
     training_only: Vec<TensorView>,
 }
 
 /// Reader of the parameters of Gaussians from the tensors of a checkpoint.
 #[derive(Debug)]
 pub(in crate::models) struct CheckpointReader {
-    /// Tensors that have been read so far.
+    /// Tensors of the checkpoint that have been read so far.
     pub(in crate::models) tensors: RowTensors,
-    /// Parameters of all Gaussians that have been read so far; the others are zero.
+    /// Parameters of all Gaussians. Parameters from tensors that have not been read yet are zero.
     pub(in crate::models) raw: StoredParams,
     /// Number of infinite opacity logits that have been replaced so far.
     infinite_logits: usize,
@@ -110,8 +110,9 @@ impl CheckpointReader {
             .then(|| format!("{replaced} of {all} rows repaired: infinite opacity logit; {INFINITE_LOGIT_REPAIR}"))
     }
 
-    /// Reads the tensor at the node `id` of the checkpoint. `name` is what error messages call it, `row` is the
-    /// expected shape of a row, and `planes` is the meaning of each value of a row.
+    /// Reads the tensor at the node `id` of the checkpoint. `name` names it in error messages. `row` is its expected
+    /// shape without the first axis, which counts the Gaussians. `planes` is the meaning of each value in a row (the
+    /// values of one Gaussian).
     ///
     /// # Errors
     /// Fails if there is no floating-point tensor of that shape, or if values are missing. Values may be NaN; infinite
@@ -179,9 +180,10 @@ impl RowTensors {
         self.training_only.iter().map(|tensor| tensor.id)
     }
 
-    /// Writes the checkpoint of the compressed model to `path`. `before` holds the parameters of the original
-    /// Gaussians, `raw_left` those of the Gaussians in `reduction`. A row is copied byte for byte if both agree. In
-    /// tensors that only the training reads, the rows of proxies (Gaussians that replace merged ones) become zero.
+    /// Writes the checkpoint of the compressed model `reduction` to `path`. `before` holds the parameters of the
+    /// original Gaussians, `raw_left` those of the Gaussians in `reduction`. The row of a Gaussian is copied byte for
+    /// byte if its parameters are unchanged. In tensors that only the training reads, the rows of proxies (Gaussians
+    /// that replace merged ones) become zero.
     ///
     /// # Errors
     /// Fails if a tensor cannot be read or a write fails.

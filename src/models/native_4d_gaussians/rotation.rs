@@ -1,8 +1,10 @@
 //! Four-dimensional rotations, given as pairs of quaternions.
 //!
-//! The rotation matrix is R = L(l)·R̄(r), for vectors (w, x, y, z). L multiplies from the left by the unit quaternion
-//! l, and R̄ from the right by the conjugate of the unit quaternion r. If the order of the rows and of the columns of R
-//! is then reversed, they belong to the axes x, y, z and t of space and time, in this order. Source:
+//! The rotation matrix is R = L(l)·R̄(r). It acts on vectors that stand for quaternions (w, x, y, z). L multiplies from
+//! the left by the unit quaternion l, and R̄ from the right by the conjugate of the unit quaternion r.
+//!
+//! Models apply a matrix to the axes x, y, z and t of space and time, in this order. In checkpoints since 15 September
+//! 2024, this matrix is R with its rows and its columns in reversed order; in older ones it is R itself. Source:
 //! `build_rotation_4d` of the repository fudan-zvg/4d-gaussian-splatting on GitHub.
 
 /// 4×4 matrix, row by row.

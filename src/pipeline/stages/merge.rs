@@ -150,8 +150,8 @@ impl MergeStage {
     /// Gaussians that may survive, and the proxies (Gaussians that replace merged clusters).
     pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
-        // Only base colors are compared. There is at most one proxy for every two Gaussians, held before and after a
-        // pass, and then once with all SH coefficients.
+        // Only base colors are compared, so proxies are held without higher SH degrees before and after a pass (twice).
+        // Later they are held once, with all SH coefficients. There is at most one proxy for every two Gaussians.
         let proxies = state_bytes(0, Attributes::all()).max(work.state_bytes(Attributes::all()).div_ceil(2));
         let per_gaussian = vec![
             // The importances C (contribution) and Vis (fraction of views that may show the Gaussian) are read back
@@ -230,14 +230,16 @@ impl MergeStage {
     }
 }
 
-/// Finds the number m of survivors (Gaussians left by pruning) that merging must get as input so that about `target`
-/// Gaussians are left after it. Merging replaces each cluster of similar Gaussians in its input by one Gaussian. The
-/// callback `merged` runs merging on m survivors and returns the number of Gaussians that are left.
+/// Finds how many survivors (Gaussians left by pruning) merging must get as input so that about `target` Gaussians are
+/// left after it. Merging replaces each cluster of similar Gaussians by one Gaussian. `merged` runs merging on the
+/// given number of survivors and returns the number of Gaussians that are left. `all` is the number of all survivors.
 ///
-/// Returns about the largest m, from `target` to `all`, for which at most `target` Gaussians are left. For m = `target`
-/// this is always so. With more survivors as input, merging leaves more Gaussians, except for small dips, so the
-/// interval of possible m is narrowed by the secant method. The search ends early if the number left is below `target`
-/// by at most a thousandth of it; the caller then makes fewer joins, so that exactly `target` Gaussians are left.
+/// Returns about the largest number m, from `target` to `all`, with which at most `target` Gaussians are left. There is
+/// such an m, because m = `target` meets the condition. The search narrows the interval of possible m by the secant
+/// method. This works because more survivors leave more Gaussians after merging, except for small dips.
+///
+/// The search ends early if the number left is below `target` by at most a thousandth of it. The caller then makes
+/// fewer joins, so that exactly `target` Gaussians are left.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;

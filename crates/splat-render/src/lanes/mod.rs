@@ -4,9 +4,11 @@
 //! All implementations give the same bits. Every operation is a single IEEE operation. Multiply-adds are not fused:
 //! fused ones would make renders depend on the machine, and are slow without hardware support.
 //!
-//! An AVX-512 vector has two groups, a vector of the other implementations has one. There are two ways to sum over
-//! groups with the same result on all machines: the two groups of an AVX-512 vector are added one after the other, or
-//! the groups with even and with odd index are summed separately ([`EvenOddSums`]).
+//! An AVX-512 vector has two groups, a vector of the other implementations has one. Groups are added lane by lane, so a
+//! sum of groups has eight values. There are two kinds of sums. Each has the same result on all machines, because its
+//! additions are made in the same order:
+//! - [`Sums`]: one sum, to which all groups are added one after the other;
+//! - [`EvenOddSums`]: two sums, one of the groups with even index and one of the groups with odd index.
 
 mod portable;
 
@@ -62,11 +64,11 @@ const EXP2: [f32; 6] =
 pub(super) trait Lanes: Copy {
     /// Mask: one truth value per lane.
     type Mask: Copy;
-    /// Type of the sum of several groups of eight lanes. It has eight values: value k is the sum of lane k of all
-    /// groups that were added.
+    /// Type of the sum of several groups of eight lanes. Groups are added lane by lane, so the sum has eight values:
+    /// value k is the sum of lane k of all groups.
     type Sums: Sums;
-    /// Type of a pair of sums over groups of eight lanes: one sum over the groups with even index, and one over the
-    /// groups with odd index. Each sum has eight values, one per lane.
+    /// Type of two sums of groups of eight lanes. Groups with even index are added to the first sum, groups with odd
+    /// index to the second. Groups are added lane by lane, so each of the two sums has eight values.
     type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
     /// Number of groups of eight lanes in a vector; a power of two.
     const GROUPS: usize;
@@ -81,11 +83,11 @@ pub(super) trait Lanes: Copy {
     /// Returns a vector that has a different value in each group: all lanes of group k hold
     /// `values.as_flattened()[first + k]`. `first` is a multiple of [`Lanes::GROUPS`].
     fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Loads a vector from `from`, an array of groups of eight values: the [`Lanes::GROUPS`] groups from index `first`
-    /// on. `first` is a multiple of [`Lanes::GROUPS`].
+    /// Loads a vector from [`Lanes::GROUPS`] consecutive groups of `from`, an array of groups of eight values. `first`
+    /// is the index of the first of these groups, a multiple of [`Lanes::GROUPS`].
     fn load<const N: usize>(from: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Stores the vector to `to`, an array of groups of eight values: to the [`Lanes::GROUPS`] groups from index
-    /// `first` on. `first` is a multiple of [`Lanes::GROUPS`].
+    /// Stores the vector to [`Lanes::GROUPS`] consecutive groups of `to`, an array of groups of eight values. `first`
+    /// is the index of the first of these groups, a multiple of [`Lanes::GROUPS`].
     fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize);
     /// Returns the sum `self + other` in each lane.
     fn add(self, other: Self) -> Self;
@@ -95,9 +97,9 @@ pub(super) trait Lanes: Copy {
     fn mul(self, other: Self) -> Self;
     /// Returns the quotient `self / other` in each lane.
     fn div(self, other: Self) -> Self;
-    /// Returns the smaller value of each lane; the value of `other` if either is NaN.
+    /// Returns the smaller of the values of `self` and `other` in each lane; the value of `other` if either is NaN.
     fn min(self, other: Self) -> Self;
-    /// Returns the larger value of each lane; the value of `other` if either is NaN.
+    /// Returns the larger of the values of `self` and `other` in each lane; the value of `other` if either is NaN.
     fn max(self, other: Self) -> Self;
     /// Returns the mask of the lanes with `self ≥ other`, which is false for NaN.
     fn at_least(self, other: Self) -> Self::Mask;
@@ -115,7 +117,7 @@ pub(super) trait Lanes: Copy {
     fn all_negative(self) -> bool;
     /// Returns the largest value of all lanes. No lane may be NaN.
     fn largest(self) -> f32;
-    /// Adds each group of the vector to `sums`, one group after the other, and returns the result.
+    /// Adds each group of the vector to `sums` lane by lane, one group after the other, and returns the result.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
     /// Adds the groups of the vector to two sums, the groups with even index to one and the groups with odd index to
     /// the other, and returns the sums. A vector of one group is always added to the first of the two sums, see
@@ -142,11 +144,11 @@ pub(super) trait Lanes: Copy {
     }
 }
 
-/// Two sums over groups: one over the groups with even index, one over the groups with odd index. Each has one value
-/// per lane.
+/// Two sums of groups of eight lanes: one of the groups with even index, one of the groups with odd index. Groups are
+/// added lane by lane, so each of the two sums has eight values.
 ///
 /// The two groups of an AVX-512 vector are added to different sums, so that neither addition waits for the other. A
-/// vector of one group is always added to the first sum; the caller swaps the two sums after all groups with even
+/// vector of one group is always added to the first sum. The caller swaps the two sums after all groups with even
 /// index, and again after all groups with odd index.
 pub(super) trait EvenOddSums: Copy {
     type Sums: Sums;
