@@ -49,8 +49,8 @@ impl Effort {
             Effort::Default => None,
             Effort::Best => Some(EffortSettings {
                 look_pictures: 400,
-                round_pictures: 96,
-                round_turns: 3,
+                round_pictures: 144,
+                round_turns: 4,
                 round_fraction: 0.95,
                 steps: 3.0,
             }),
