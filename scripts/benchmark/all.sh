@@ -26,5 +26,6 @@ measure ablation
 measure robustness
 measure large_scene --models room2_dynerf
 measure scale
+measure format_speed
 python3 scripts/benchmark/plots.py docs/benchmarks
 SPLATSIEVE_WRITE_DOCS=1 cargo test --test command_line benchmark
