@@ -103,7 +103,7 @@ fn recipe_values_that_make_a_run_endless_are_refused() {
     let refused = |options: &str, parts: &[&str]| {
         compress(&folder, "out.ply", options).run().refused(2, parts);
     };
-    refused("--ratio 0.5 --set round_fraction=0.9999999999", &["select.round_fraction", "0.1 to 0.99"]);
+    refused("--ratio 0.5 --set round_fraction=0.9999999999", &["select.round_fraction", "0.01 to 0.99"]);
     let folder = folder_with(&cloud(7));
     let outcome =
         folder.attack("compress in.ply -o out.ply --cameras cameras.json --set refine_steps=4000000000").run();
