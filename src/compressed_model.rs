@@ -133,7 +133,7 @@ impl TrajectoryDelta {
         [(first, 1.0 - part), (first + 1, part)]
     }
 
-    /// Returns whether there are no keyframes, so that nothing is added.
+    /// Returns whether this trajectory delta has no keyframes. Such a delta leaves all attributes unchanged.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }

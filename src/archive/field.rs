@@ -200,11 +200,13 @@ impl TensorEntry {
     }
 
     /// Builds the description of this tensor that its coder needs (shape, stored rows and quantization grids), passes
-    /// it to `with`, and returns the result of `with`. Returns `None` without a call if no value of the tensor is
-    /// quantized.
+    /// it to `with`, and returns the result of `with`. Returns `None` without calling `with` if no value of the tensor
+    /// is quantized.
     ///
-    /// `readers` holds the positions and times at which the deformation field is evaluated. They determine which texels
-    /// of a feature plane are read: the stored rows and the quantization grid of each texel follow from them.
+    /// `readers` holds the positions and times at which the deformation field is evaluated. They matter only for
+    /// feature planes, whose texels (grid elements) are interpolated at these positions and times:
+    /// - The positions determine the quantization grid of each texel.
+    /// - The times determine which rows of a time plane are stored.
     fn with_quantized<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
         if self.values() == Some(0) {
             return None;

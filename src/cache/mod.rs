@@ -250,6 +250,9 @@ impl Cache {
     /// called if the full result of `stage` is not stored. The caller then computes the shards that are not stored, and
     /// joins all n.
     ///
+    /// A run that is limited to one of several shards is an exception: this function itself does its work, and returns
+    /// an error instead of n (rule 5).
+    ///
     /// The work folder may hold shards of several divisions, which differ in the number of shards. The first of these
     /// rules that applies decides:
     /// 1. There is no work folder: n is 1.
@@ -257,8 +260,9 @@ impl Cache {
     /// 3. The run is not limited to a shard: n is the number of shards of the division of which the largest fraction is
     ///    stored. If no shard is stored, n is 1.
     /// 4. The run is limited to shard 1 of 1: n is 1.
-    /// 5. The run is limited to one of several shards: computes and stores this shard with `make`, unless `find` finds
-    ///    it stored. Then returns the error [`Error::ShardDone`], which ends the run.
+    /// 5. The run is limited to one of several shards. If `find` does not find this shard stored, `make` computes and
+    ///    stores it. The error [`Error::ShardDone`] is returned in both cases. It ends the run as intended and reports
+    ///    which shards are missing.
     fn divide<T>(
         &self,
         stage: &str,

@@ -66,7 +66,8 @@ pub struct QualityMeans {
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// Mean temporal error over the pairs that have one; `None` if no view occurs at two frames.
+    /// Mean temporal error: flicker of a view from its previous evaluated frame to this one. The mean is over the
+    /// (frame, view) pairs that have a temporal error; the first frame of a view has none. `None` if no pair has one.
     pub temporal: Option<f64>,
     /// Mean FLIP; `None` if it was not requested.
     #[serde(skip_serializing_if = "Option::is_none")]

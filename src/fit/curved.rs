@@ -95,8 +95,9 @@ const WIDTH_PER_INTERVAL: f64 = 0.75;
 /// Gaussian among the curves that replace it.
 const MAX_UPDATES: usize = 60;
 /// Tolerance of the iterations in [`overlapping_curves`], which distribute the optical depth −ln(1 − opacity) of a
-/// Gaussian among the curves that replace it. The iterations end once no curve's optical depth changes by more than
-/// this fraction in one iteration. Curves with an optical depth below this value are ignored in this test.
+/// Gaussian among the curves that replace it. The iterations end once each curve meets one of two conditions:
+/// - The last iteration changed the curve's optical depth by less than this fraction.
+/// - The curve's optical depth before the last iteration was below this value, so the curve is nearly invisible.
 const CONVERGED: f64 = 1e-3;
 /// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 const MAX_OPACITY: f64 = 0.999;

@@ -353,9 +353,11 @@ impl SearchStage {
         }
     }
 
-    /// Returns by how much the quality `value` (PSNR or loss of PSNR, dB) is better than the search requires. Unit:
-    /// halvings of the number of Gaussians; a surplus of 1 allows about half as many Gaussians. Negative if the quality
-    /// is worse than required.
+    /// Estimates by how many halvings the number of Gaussians may still decrease. `value` is the quality of the present
+    /// model, dB: its PSNR or its loss of PSNR. The estimate follows from [`COST_OF_HALVING`]:
+    /// - 0: the quality is exactly the required one.
+    /// - 1: the quality is so high that half as many Gaussians would suffice.
+    /// - Below 0: the quality is worse than required, so more Gaussians are needed.
     fn surplus(&self, value: f64) -> f64 {
         match self.searched {
             // Renders with NaN or infinity never pass.

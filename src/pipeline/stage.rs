@@ -345,7 +345,8 @@ pub struct RunState<'a> {
     pub prune_steps: Option<PrunedModels<'a>>,
     /// Numbers of Gaussians that the merge stage merged, if it ran.
     pub merge: Option<MergeSummary>,
-    /// Result of the search for a quality, if one was requested.
+    /// Result of the search for the smallest model that has the requested quality (minimum PSNR or maximum loss of
+    /// PSNR). `None` if no quality was requested, or before the search.
     pub goal: Option<GoalSummary>,
     /// Content of the archive, if the output is an archive.
     pub archived: Option<PreparedArchive>,

@@ -1,21 +1,29 @@
-//! Encoding of a sequence of frames for the player page as chunks of bytes: first a chunk with the first frame, then
-//! one chunk per group of frames, as differences in time.
+//! Encoding of a sequence of frames for the player page as chunks of bytes. The first chunk holds the first frame. Each
+//! later chunk holds one group of consecutive frames as differences in time.
 //!
 //! Input: a source of frames. Output: chunks of bytes, in order. Memory: one state, and the quantized values of the
 //! frames of one group, which are at most [`MAX_VALUES_PER_FRAME_GROUP`] unless the group has only one frame.
 //!
-//! Chunk 0 holds the first frame with every scalar component (such as the x of the position). Each later chunk holds
-//! one group of consecutive frames, with the components of varying attributes. To decode a chunk, only this chunk and
-//! chunk 0 are needed.
+//! Values are quantized to integers. A component is one scalar of every Gaussian, such as the x of the position. Chunk
+//! 0 holds all components; later chunks hold only the components of attributes that vary in time. To decode a chunk,
+//! only this chunk and chunk 0 are needed.
 //!
-//! A chunk is a zlib stream (RFC 1950). For each of its components it holds a byte of flags, then planes of bytes:
-//! - Flags: bits 0 to 2 are the number of planes, bit 3 says that differences are of second order, bit 4 says that some
-//!   value takes more than 16 bits.
-//! - Plane k holds byte k of every difference. A difference d is coded as 2d, or as −2d − 1 if it is negative. The
-//!   order is Gaussian by Gaussian, and frame by frame for one Gaussian. If there are no planes, all differences are 0.
-//! - The first difference of a Gaussian in a chunk is relative to the first frame of the sequence (in chunk 0: to 0),
-//!   and the second is relative to the frame before. Later differences are relative to the frame before, or, if they
-//!   are of second order, to the value that a repetition of the last change between two frames would give.
+//! A chunk is a zlib stream (RFC 1950). For each of its components, one after another, it holds:
+//! 1. One byte of flags. Bits 0 to 2: number of planes. Bit 3: differences are of second order. Bit 4: some value of
+//!    the component does not fit into a signed 16-bit integer.
+//! 2. The planes. Plane k holds byte k (byte 0 is the lowest) of the code of every difference: first the differences of
+//!    Gaussian 0 at all frames of the chunk, then those of Gaussian 1, and so on. Without planes, all
+//!    differences are 0.
+//!
+//! The code of a difference d is 2d, or −2d − 1 if d is negative.
+//!
+//! A difference is the value of a Gaussian at a frame minus a prediction. The prediction depends on the frame:
+//! - First frame of chunk 0: 0.
+//! - First frame of a later chunk: the value at the first frame of the sequence.
+//! - Second frame of a chunk: the value at the frame before.
+//! - Later frames, first order: the value at the frame before.
+//! - Later frames, second order: the value at the frame before plus the last change. If a and b are the values at the
+//!   two frames before, this is b + (b − a).
 
 use std::io::Write;
 

@@ -95,8 +95,10 @@ pub struct RefineStage {
 
 impl RefineStage {
     /// Returns the refinement stage with the parameters of `recipe`, or `None` if `recipe` optimizes no attribute or
-    /// has no steps. `target`: fraction of the Gaussians that the user wants to keep. `cuts`: whether prune steps are
-    /// possible, that is, whether the run ranks Gaussians by renders.
+    /// has no optimization steps.
+    /// - `target`: fraction of the Gaussians that the user wants to keep; `None` if not given.
+    /// - `cuts`: whether refinement may remove Gaussians in prune steps between optimization steps. Prune steps need a
+    ///   run that ranks Gaussians by renders.
     pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
         let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
             recipe.refine;

@@ -288,13 +288,18 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     ))
 }
 
-/// Returns the totals of each of the three kinds of Gaussian ([`GaussianKind`]: fast, thin, changing in appearance):
-/// - the number of Gaussians of the kind, and how many of them were dropped and merged;
-/// - the fraction that the kind has of the contribution (Σ alpha · transmittance) of all Gaussians, and the fraction of
-///   the kind's contribution that its dropped and merged Gaussians have.
+/// Returns the totals of each of the three kinds of Gaussian ([`GaussianKind`]: fast, thin, changing in appearance).
+/// For each kind these are:
+/// - the number of its Gaussians;
+/// - the number of its dropped Gaussians and the number of its merged Gaussians;
+/// - its contribution to renders (Σ alpha · transmittance), as a fraction of the contribution of all Gaussians;
+/// - the contribution of its dropped and merged Gaussians, as a fraction of the contribution of the kind.
 ///
-/// `rows` holds the statistics of every Gaussian, `traits` states of which kinds it is, and `fates` whether it was
-/// kept, merged or dropped. `fates` is `None` without an index map (file that maps input to output Gaussians).
+/// Arguments, each with one entry per Gaussian:
+/// - `rows`: statistics.
+/// - `traits`: for each kind, whether the Gaussian is of this kind.
+/// - `fates`: whether the Gaussian was kept, merged or dropped. `None` if there is no index map (file that maps input
+///   to output Gaussians).
 fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindTotals; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);

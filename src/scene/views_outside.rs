@@ -196,13 +196,14 @@ fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
 }
 
 impl Scene {
-    /// Adds views from cameras outside the rig to the views of every frame (`self.schedule`), so that Gaussians that
-    /// only these views show are kept and refined. `reach`, from 0 to 1, states how far outside these cameras are, and
-    /// how many views they add:
-    /// - Each added camera is made from a camera of the rig, or between two of them, by a rotation about the point
-    ///   where the optical axes meet. The rotation multiplies the camera's angle from the mean direction of the rig by
-    ///   up to 1 + `reach`.
-    /// - Every frame gets `reach` times as many views outside the rig as it has inside, rounded up.
+    /// Adds views from cameras outside the rig (the cameras of the scene) to the views of every frame
+    /// (`self.schedule`). Gaussians that only these views show are then kept and refined.
+    ///
+    /// `reach` is a number from 0 to 1 with two effects:
+    /// - Position of the added cameras: each is a camera of the rig, or a camera between two of them, rotated about the
+    ///   point where the optical axes meet. The rotation multiplies its angle from the mean direction of the rig by a
+    ///   random factor from 1 to at most 1 + `reach`.
+    /// - Number of added views: a frame with n views gets `reach` · n more, rounded up.
     ///
     /// Adds no views if `reach` is 0 or if no camera outside the rig can be found (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {

@@ -140,9 +140,12 @@ fn uneven_steps(times: &[f64]) -> Vec<f64> {
     if steps().all(|step| (step - 1.0).abs() <= EVEN_TOLERANCE) { Vec::new() } else { steps().collect() }
 }
 
-/// Returns the largest exponent e for which a contribution of `image_px` pixels (the whole image), times 2ᵉ, has at
-/// most [`CONTRIBUTION_BITS`] bits. It does not depend on the number of contributions, which is unknown for a stream;
-/// the sums carry their high bits instead.
+/// Returns the exponent e of the fixed-point format of contributions: a contribution of x pixels is stored as the
+/// integer nearest to x · 2ᵉ. e is the largest exponent for which the largest contribution, `image_px` pixels (the
+/// whole image), fits in [`CONTRIBUTION_BITS`] bits.
+///
+/// e does not depend on the number of contributions, which is unknown for a stream. Their sums cannot overflow
+/// nevertheless: after every [`PAIRS_PER_CARRY`] contributions, the high bits of a sum are moved to a second counter.
 fn coverage_exponent(image_px: f64) -> i32 {
     CONTRIBUTION_BITS - image_px.log2().ceil() as i32
 }

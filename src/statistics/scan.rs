@@ -142,9 +142,12 @@ impl<'a> BlockScan<'a> {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// Updates the state, the life spans and the motion sums of the block with frame `t`. `changed` names the
-    /// attributes of `gaussians` that may differ from the previous frame. The compiler inlines this function and the
-    /// loops that it calls into one copy per instruction set.
+    /// Adds the Gaussians of frame `t` to the parts of the scan that need no cameras: current state, life spans,
+    /// numbers of alive Gaussians, and motion sums. `changed` names the attributes of `gaussians` that may differ from
+    /// the previous frame.
+    ///
+    /// This function and the loops that it calls are inlined into each caller. So the compiler makes one version for
+    /// portable code and one for AVX2.
     #[inline(always)]
     fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.state.update(gaussians, changed);

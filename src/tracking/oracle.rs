@@ -370,16 +370,19 @@ pub(super) fn slow_joined_tracks(
 }
 
 /// Joins tracks (Gaussians followed through frames) that seem to be one Gaussian. Each of `pairs` has an earlier track,
-/// a later track that may continue it, and a cost (distance and difference in appearance). The steps are:
-/// 1. For each later track, select its pair of lowest cost. Drop the selected pairs whose earlier track has not ended.
-/// 2. Join the tracks of the selected pairs in the order of cost. Skip a pair if its earlier track is already
-///    continued.
-/// 3. Remove pairs that cannot be joined any more: the later track is joined, or the earlier track has ended and is
-///    continued by another track.
-/// 4. Repeat from step 1, until it selects no pair.
+/// a later track that may continue it, a cost (distance and difference in appearance), and whether the earlier track
+/// has ended (see [`TrackPairs`]). Repeats these steps:
+/// 1. For each later track, select its pair of lowest cost.
+/// 2. Ignore, in this repetition, selected pairs whose earlier track has not ended.
+/// 3. Go through the other selected pairs by increasing cost. Join the two tracks of a pair, unless the earlier track
+///    is already continued by another track.
+/// 4. Remove from `pairs` every pair whose later track is joined.
+/// 5. Remove from `pairs` every pair whose earlier track has ended and is already continued.
+/// 6. Stop if step 2 left no selected pair.
 ///
-/// The joins are recorded: `predecessor` holds for each track the earlier track that it continues, and `has_successor`
-/// whether a later track continues it.
+/// The joins are recorded in two lists with one entry per track:
+/// - `predecessor`: number of the earlier track that the track continues, or `None`.
+/// - `has_successor`: whether a later track continues the track.
 fn join_ended(pairs: &mut TrackPairs, predecessor: &mut [Option<usize>], has_successor: &mut [bool]) {
     loop {
         let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();

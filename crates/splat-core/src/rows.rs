@@ -47,13 +47,16 @@ pub enum Statistic {
     W,
 }
 
-/// Access to the array of one statistic in [`StatisticRows`]: two functions that return this array, the first for
-/// reading and the second for writing.
+/// Access to the array that holds the values of one statistic in [`StatisticRows`]. The variant states the type of the
+/// values. Each variant has two functions:
+/// - The first returns a shared reference to the array.
+/// - The second returns a mutable reference to the same array.
 #[derive(Debug, Clone, Copy)]
 pub enum StatisticArray {
-    /// Functions for a statistic whose values are real numbers: the array for reading, the array for writing.
+    /// For a statistic whose values are real numbers: functions that return the array for reading, and for writing.
     F64(fn(&StatisticRows) -> &Vec<f64>, fn(&mut StatisticRows) -> &mut Vec<f64>),
-    /// Functions for a statistic whose values are numbers of frames: the array for reading, the array for writing.
+    /// For a statistic whose values are numbers of frames: functions that return the array for reading, and for
+    /// writing.
     U32(fn(&StatisticRows) -> &Vec<u32>, fn(&mut StatisticRows) -> &mut Vec<u32>),
 }
 

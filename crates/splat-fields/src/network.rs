@@ -67,13 +67,14 @@ pub struct EncodedPositions {
     values: Vec<CacheLine>,
 }
 
-/// Motion that the network computes for a block of Gaussians at one time: the outputs of its heads (output layers). An
-/// attribute for which the network has no head is empty. All attributes are empty until [`Network::motion`] computes
-/// them.
+/// Motion that the network computes for a block of Gaussians at one time: the outputs of its heads (output layers).
+/// Each field holds an attribute as planes. A plane is an array of one component of the attribute, such as x, with one
+/// value per Gaussian. An attribute for which the network has no head is empty. All attributes are empty until
+/// [`Network::motion`] computes them.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
-    /// Position offset: 3 planes, scene units. If the network predicts screw motions: 6 planes, the rotation part w and
-    /// then the translation part v of the screw.
+    /// Offset of the position: 3 planes (x, y, z of all Gaussians), scene units. If the network predicts screw motions:
+    /// 6 planes, 3 for the rotation part w and then 3 for the translation part v of the screw.
     pub warp: AttributeValues,
     /// Offset of the quaternion: 4 planes in the order w, x, y, z.
     pub rotation: AttributeValues,

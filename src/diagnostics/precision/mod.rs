@@ -138,8 +138,8 @@ const SKETCH_BYTES: u64 = 4 << (9 + MAX_MANTISSA_BITS);
 const HELD_BYTES: u64 =
     (2 * StatisticRows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
 
-/// Data that the measurements of all settings share: scene, recipe, statistics of the scan, number of Gaussians to
-/// keep, limits on repeated runs, and the folder for results.
+/// Data that all measurements share. A measurement computes with one setting (one value of a parameter of the program)
+/// and measures its error, time and memory.
 struct Bench<'a> {
     /// Scene, with the training views of at most [`PrecisionOptions::max_frames`] of its frames.
     scene: &'a Scene,

@@ -155,8 +155,9 @@ impl Bench<'_> {
         self.curve(name, "all pixels of all these views", tried, own, &[])
     }
 
-    /// Computes the scores of all Gaussians from the statistics of the scan and from `contributions`, and selects the
-    /// Gaussians to keep.
+    /// Computes the scores of all Gaussians and selects the Gaussians to keep. The scores follow from the statistics of
+    /// the scan and from `contributions`, the contributions of the Gaussians to renders. `contributions` is `None` if
+    /// the recipe does not rank by renders; the scores then follow from the statistics alone.
     fn scored(&self, contributions: Option<VisibleContribution>) -> Result<Scored> {
         let measure = MeasureStages::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
         measure.score.run(self.scene, self.scanned.clone(), contributions, &mut Journal::default())

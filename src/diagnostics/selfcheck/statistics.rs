@@ -292,14 +292,16 @@ fn without_views(frames: usize) -> ViewSchedule {
     schedule
 }
 
-/// Returns the statistics that the scan of the program computes for `frames` at evenly spaced times.
+/// Returns the statistics of all Gaussians as [`BlockScan`], the code that is checked here, computes them. `frames`
+/// holds the Gaussians at each frame; frame t is at time t. `schedule` holds the views of each frame.
 fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
-/// Returns the statistics that the scan of the program computes for `frames` at the times `times`. Also gives the scan
-/// the hint which frames have the same opacities as the frame before, as readers of models do.
+/// Returns the statistics of all Gaussians as [`BlockScan`], the code that is checked here, computes them. `frames`
+/// holds the Gaussians at each frame; frame t is at time `times[t]`. `schedule` holds the views of each frame. As
+/// readers of models do, tells the scan at each frame whether the opacities equal those of the frame before.
 fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);

@@ -120,10 +120,13 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
     }
 }
 
-/// Repairs interrupted moves of results to the name of `target`: completes each move, or gives the earlier result its
-/// name back. Warns the user about a move for which this fails. The caller holds the [`PublishLock`].
+/// Repairs interrupted moves of results to the name of `target`. A run first writes its result into a workspace (hidden
+/// folder beside `target`). It then moves the result to its final name by one or more renames. If the run is killed
+/// between these renames, the move is interrupted. This function completes such a move, or gives the earlier result its
+/// name back. If that fails, it warns the user. The caller holds the [`PublishLock`].
 ///
-/// `supersedes` states what happens to the journal (list of files still to be moved) after such a failure:
+/// A result of several files has a journal in its workspace: the list of files and final names, from which a later run
+/// can complete the move. `supersedes` states what happens to the journal if the repair fails:
 /// - If true, it is deleted. The caller is about to move its own result to this name, and no later run may overwrite
 ///   that result by completing the old move.
 /// - If false, it stays, and a later run tries again.

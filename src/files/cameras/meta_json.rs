@@ -98,7 +98,8 @@ struct Tables {
 }
 
 impl Tables {
-    /// Adds one value of the key `KEYS[key]` to the current frame. The value is read from the JSON object `own`.
+    /// Appends one value to the table of the key `KEYS[key]`: the value of the next camera of the current frame. `own`
+    /// is a JSON object that holds this value under its key.
     fn take(&mut self, own: CameraFields<'_>, key: usize) -> Result<()> {
         match key {
             0 => {

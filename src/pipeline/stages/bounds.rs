@@ -140,8 +140,9 @@ pub(crate) fn find(
     Ok((ErrorBounds::new(widths), summary))
 }
 
-/// Returns the estimated size, in bytes, of an archive of the frames of `source`: the size with fixed error bounds, for
-/// which nothing has to be rendered.
+/// Returns an estimate of the size, in bytes, of an archive of the frames of `source`: the size with the initial error
+/// bounds, widened by [`ESTIMATE_OCTAVES`]. The final error bounds of an archive are chosen by rendering; the estimate
+/// renders nothing.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.

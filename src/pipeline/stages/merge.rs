@@ -230,16 +230,19 @@ impl MergeStage {
     }
 }
 
-/// Finds how many survivors (Gaussians left by pruning) merging must get as input so that about `target` Gaussians are
-/// left after it. Merging replaces each cluster of similar Gaussians by one Gaussian. `merged` runs merging on the
-/// given number of survivors and returns the number of Gaussians that are left. `all` is the number of all survivors.
+/// Finds how many survivors (Gaussians left by pruning) to merge, so that about `target` Gaussians are left afterwards.
+/// Merging consists of joins; each join replaces two similar Gaussians or clusters by one, so it lowers the number of
+/// Gaussians by 1.
+/// - `all`: number of all survivors.
+/// - `merged`: merges the given number of survivors with all possible joins, and returns the number of Gaussians left.
 ///
-/// Returns about the largest number m, from `target` to `all`, with which at most `target` Gaussians are left. There is
-/// such an m, because m = `target` meets the condition. The search narrows the interval of possible m by the secant
-/// method. This works because more survivors leave more Gaussians after merging, except for small dips.
+/// Returns about the largest number m, from `target` to `all`, for which at most `target` Gaussians are left. Such an m
+/// exists: for m = `target` the condition holds. The caller merges m survivors again and stops after m − `target`
+/// joins. Then exactly `target` Gaussians are left.
 ///
-/// The search ends early if the number left is below `target` by at most a thousandth of it. The caller then makes
-/// fewer joins, so that exactly `target` Gaussians are left.
+/// The search narrows the interval of possible m by the secant method. This works because more survivors leave more
+/// Gaussians after merging, except for small dips. It ends early if the number of Gaussians left is at most a
+/// thousandth of `target` below `target`.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;

@@ -49,7 +49,8 @@ pub(crate) const OCTAVE_HALVINGS: usize = 6;
 /// byte limit: from the coarsest to the finest steps. The search follows the balancing rounds, and finds the finest
 /// steps with which the archive fits the limit.
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
-/// Number of bisection steps that find the common change of all quantization steps within [`BYTES_OCTAVE_RANGE`].
+/// Number of bisection steps of the search in [`BYTES_OCTAVE_RANGE`] for the finest quantization steps with which an
+/// archive fits its byte limit. Each bisection step encodes an archive and halves the range.
 pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;
 
 /// Returns the number of views on which an archive is compared with the result before quantization, if each view has

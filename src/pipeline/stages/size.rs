@@ -27,8 +27,8 @@ const NAME: &str = "size";
 /// Fraction of the byte limit that may remain unused. The search for the number of Gaussians that fit the limit ends
 /// once at most this fraction is unused.
 const MAX_UNUSED: f64 = 0.01;
-/// Maximum number of sizes (numbers of Gaussians) for which the search for the number that fits writes an output to
-/// measure its bytes.
+/// Maximum number of trials in the search for the number of Gaussians that fits the byte limit. Each trial writes an
+/// output with one number of Gaussians and measures its bytes.
 const MAX_TRIED: usize = 8;
 /// Number of views by which Gaussians are ranked if the result exceeds the byte limit.
 const RANKING_VIEWS: usize = 48;
