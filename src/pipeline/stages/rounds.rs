@@ -128,11 +128,10 @@ impl Rounds {
             work.reading_seconds(left, pictures.min(work.frames as f64))
                 + work.render_seconds(pictures, left, REMOVAL_COST)
         });
-        // The first round renders the views of all groups, each with its own frames.
+        // The first round renders the views of all groups one group after the other, every later round one group.
         let frames = all.min(work.frames).div_ceil(turns);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
-        let reads =
-            work.scattered_full_reads(frames * turns, limits) + later * work.scattered_full_reads(frames, limits);
+        let reads = (turns as f64 + later) * work.scattered_full_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
