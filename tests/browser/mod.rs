@@ -11,6 +11,7 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
 use serde_json::{Value, json};
+use splatsieve::render::Image;
 use tempfile::TempDir;
 
 const NAMES: [&str; 5] =
@@ -27,6 +28,11 @@ pub(crate) fn installed() -> PathBuf {
     let found = NAMES.iter().flat_map(|name| std::env::split_paths(&path).map(move |folder| folder.join(name)));
     let found = found.into_iter().find(|file| file.is_file());
     found.expect("an installed Chromium (apt-get install chromium-headless-shell)")
+}
+
+/// Returns the image of `width` × `height` pixels whose red, green and blue are `rgb`, row by row from the top left.
+pub(crate) fn image_from_bytes(width: u32, height: u32, rgb: &[u8]) -> Image {
+    Image { width, height, data: rgb.iter().map(|&byte| f32::from(byte) / 255.0).collect() }
 }
 
 /// Running browser with one page.

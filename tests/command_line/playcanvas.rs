@@ -8,6 +8,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use serde_json::json;
+use splatsieve::metrics::psnr;
 use splatsieve::model::{Camera, Gaussians};
 use splatsieve::render::{Image, render};
 
@@ -28,8 +29,8 @@ fn large_gaussians() -> Gaussians {
     made
 }
 
-/// Returns red, green and blue of every pixel, as the engine draws the file `sog` from `camera` on black.
-fn drawn(page: &mut Browser, workplace: &Workplace, sog: &str, camera: &Camera) -> Vec<u8> {
+/// Returns the image that the engine draws of the file `sog` from `camera` on black.
+fn drawn(page: &mut Browser, workplace: &Workplace, sog: &str, camera: &Camera) -> Image {
     let engine = fs::canonicalize(modules().join("playcanvas/build/playcanvas.js")).unwrap();
     let rows = [0, 1, 2].map(|row| camera.rotation.row(row).to_array());
     let view = json!({
@@ -41,14 +42,8 @@ fn drawn(page: &mut Browser, workplace: &Workplace, sog: &str, camera: &Camera) 
     fs::write(workplace.path("engine.html"), text).unwrap();
     page.events.clear();
     page.open(&workplace.path("engine.html"));
-    STANDARD.decode(page.value("rendered").as_str().unwrap()).unwrap()
-}
-
-/// Returns the PSNR of 8-bit pixels against `picture`, dB.
-fn psnr(pixels: &[u8], picture: &Image) -> f64 {
-    assert_eq!(pixels.len(), picture.data.len());
-    let square = |(a, b): (&u8, &f32)| (f64::from(*a) / 255.0 - f64::from(b.clamp(0.0, 1.0))).powi(2);
-    -10.0 * (pixels.iter().zip(&picture.data).map(square).sum::<f64>() / pixels.len() as f64).log10()
+    let rgb = STANDARD.decode(page.value("rendered").as_str().unwrap()).unwrap();
+    browser::image_from_bytes(camera.width, camera.height, &rgb)
 }
 
 #[test]
@@ -65,10 +60,10 @@ fn playcanvas_draws_our_sog_sequence_as_the_rasterizer() {
     let camera = Camera::look_at(eye, target, 65f64.to_radians(), (640, 480));
     let mut page = Browser::start_drawing(&browser::installed());
     for (number, frame) in frames.iter().enumerate() {
-        let pixels = drawn(&mut page, &workplace, &format!("book/frame_{number:04}.sog"), &camera);
-        let right = psnr(&pixels, &render(frame, &camera, [0.0; 3]));
+        let image = drawn(&mut page, &workplace, &format!("book/frame_{number:04}.sog"), &camera);
+        let right = psnr(&image, &render(frame, &camera, [0.0; 3]));
         assert!(right > MIN_PSNR, "frame {number}: {right:.1} dB");
-        let wrong = psnr(&pixels, &render(&reversed(frame), &camera, [0.0; 3]));
+        let wrong = psnr(&image, &render(&reversed(frame), &camera, [0.0; 3]));
         assert!(wrong < WRONG_PSNR, "frame {number} with reversed axes: {wrong:.1} dB");
     }
 }

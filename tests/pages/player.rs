@@ -11,6 +11,7 @@ use crate::scene::{Workplace, state};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
+use splatsieve::metrics::psnr;
 use splatsieve::render::render;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
@@ -46,12 +47,8 @@ fn decibels(page: &mut Browser, scene: &Scene, show: &str, view: u32, frame: usi
     let (width, height, found) = pixels(page);
     let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
     let picture = render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
-    assert_eq!((width, height), (picture.width, picture.height));
-    assert_eq!(found.len(), picture.data.len());
-    let square = |(a, b): (&u8, &f32)| (f64::from(*a) / 255.0 - f64::from(b.clamp(0.0, 1.0))).powi(2);
-    let mean = found.iter().zip(&picture.data).map(square).sum::<f64>() / found.len() as f64;
     assert!(picture.data.iter().any(|x| (x - picture.data[0]).abs() > 0.2), "an empty picture tells nothing");
-    -10.0 * mean.log10()
+    psnr(&browser::image_from_bytes(width, height, &found), &picture)
 }
 
 /// Returns the faults of the page with three exceptions: its worker, files of its own folder, and messages of a
@@ -340,13 +337,11 @@ fn a_trained_model_looks_as_in_the_rasterizer() {
         page.open(&at.path("scene.html"));
         for (view, shown, frame) in [(0, 0, 0), (1, 2, 39), (8, 3, 59)] {
             go(&mut page, &format!("camera={view}&frame={shown}&paused&exact&x={name}"));
-            let (_, _, found) = pixels(&mut page);
+            let (width, height, found) = pixels(&mut page);
             let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
             let picture =
                 render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
-            let square = |(a, b): (&u8, &f32)| (f64::from(*a) / 255.0 - f64::from(b.clamp(0.0, 1.0))).powi(2);
-            let mean = found.iter().zip(&picture.data).map(square).sum::<f64>() / found.len() as f64;
-            let decibels = -10.0 * mean.log10();
+            let decibels = psnr(&browser::image_from_bytes(width, height, &found), &picture);
             eprintln!("{name}, view {view}, frame {frame}: {decibels:.1} dB");
             assert!(decibels >= LEAST_DB, "{name}, view {view}, frame {frame}: {decibels} dB");
         }
