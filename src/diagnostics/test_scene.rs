@@ -23,6 +23,9 @@ use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
 
+/// File name of the container with the frames of the scene.
+const SCENE_FILE: &str = "scene.gseq";
+
 /// Options of the command `test-scene`.
 #[derive(Debug)]
 pub struct TestSceneOptions {
@@ -77,16 +80,25 @@ pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
     Ok(report)
 }
 
+/// Writes the test scene `made` into the existing folder `folder`: its frames to the container `scene.gseq`, its cameras
+/// to `cameras.json`. Returns the paths of both files, in this order. Reports progress to `events`.
+///
+/// # Errors
+/// Fails if a file cannot be written.
+pub fn write_scene(made: &demo_scene::DemoScene, folder: &Path, events: &Events) -> Result<[PathBuf; 2]> {
+    let files = [SCENE_FILE, "cameras.json"].map(|name| folder.join(name));
+    let [packed, cameras] = &files;
+    write_sequence(made, OutputKind::Gseq, packed, 1, events)?;
+    fs::write(cameras, cameras_json(&made.rig())).map_err(Error::io("write", cameras))?;
+    Ok(files)
+}
+
 fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> {
     let made = demo_scene::DemoScene::new(options.gaussians, options.frames);
-    let packed = folder.join("scene.gseq");
-    write_sequence(&made, OutputKind::Gseq, &packed, 1, &options.events)?;
-    let rig = made.rig();
-    let cameras = folder.join("cameras.json");
-    fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
+    let [packed, _] = write_scene(&made, folder, &options.events)?;
 
     let input = Box::new(Container::open(&packed)?);
-    let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
+    let mut scene = Scene::new(PathBuf::from(SCENE_FILE), input, made.rig(), Some(Split::Train))?;
     scene.events = options.events.clone();
     let plain = InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
     let request = Request {

@@ -88,15 +88,11 @@ pub struct EvaluateOptions {
 /// Compares a model with itself in every view:
 ///
 /// ```
-/// # use std::collections::BTreeMap;
-/// # use splatsieve::diagnostics::demo_scene::{DemoScene, cameras_json};
-/// # use splatsieve::outputs::container::write_container;
+/// # use splatsieve::diagnostics::{demo_scene::DemoScene, test_scene::write_scene};
+/// # use splatsieve::progress::Events;
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// # let folder = tempfile::tempdir()?;
-/// # let [model, cameras] = ["scene.gseq", "cameras.json"].map(|name| folder.path().join(name));
-/// # let made = DemoScene::new(400, 4);
-/// # write_container(&made, &model, gseq::Compression::Zstd(1), BTreeMap::new(), |_| ())?;
-/// # std::fs::write(&cameras, cameras_json(&made.rig()))?;
+/// # let [model, cameras] = write_scene(&DemoScene::new(400, 4), folder.path(), &Events::default())?;
 /// use splatsieve::cache::Completion;
 /// use splatsieve::evaluation::{EvaluateOptions, evaluate};
 /// use splatsieve::files::atomic::Replace;

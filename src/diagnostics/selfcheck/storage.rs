@@ -99,8 +99,8 @@ pub(super) fn archive_codes() -> CaseResult {
         worst.same(&back.cloud, &expected);
         worst.same(&back.files, &content.files);
         worst.same(&back.tensors.get("a.exact"), &content.tensors.get("a.exact"));
-        let beside: Vec<u8> = order.iter().map(|&id| content.extra_bytes[id as usize]).collect();
-        worst.same(&back.extra_bytes, &beside);
+        let extra_bytes: Vec<u8> = order.iter().map(|&id| content.extra_bytes[id as usize]).collect();
+        worst.same(&back.extra_bytes, &extra_bytes);
         Ok(worst)
     })
 }
