@@ -163,8 +163,8 @@ pub trait FrameSource: Send + Sync {
     /// Returns the number of Gaussians, the time stamps of the frames and the attributes that vary in time.
     fn info(&self) -> &SequenceInfo;
 
-    /// Opens a reader that returns the Gaussians `ids`, in the order of `ids`. Work that does not depend on time is
-    /// done once, in this call.
+    /// Opens a reader that returns the Gaussians `ids`, in the order of `ids`. This call also computes everything that
+    /// does not depend on time, so that reading many frames does not repeat it.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 
     /// Opens a reader that returns all Gaussians at the frames of the plan `_wanted`. It may take more memory per

@@ -104,8 +104,8 @@ impl Method {
         }
     }
 
-    /// Returns whether this method has thresholds by which it can choose the number of Gaussians itself, without a
-    /// target.
+    /// Returns whether this method can run without a target count: it has thresholds that determine how many Gaussians
+    /// stay.
     pub(crate) fn chooses_size(self) -> bool {
         matches!(self, Method::Default | Method::NoRefine | Method::Paper | Method::PaperPrune | Method::PaperMerge)
     }

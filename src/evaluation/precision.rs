@@ -57,7 +57,7 @@ pub enum ErrorSource {
     Discretization,
     /// Error of rounding to a finite number of digits.
     Rounding,
-    /// Error of replacing a model by a smaller one.
+    /// Error of the compressed model: it has fewer Gaussians than the original.
     Model,
 }
 

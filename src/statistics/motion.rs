@@ -34,9 +34,9 @@ const BORN_BEFORE: u8 = 4;
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// Number of frames that have the opacities of the first frame and are not counted in `steps`, `turns` and
-    /// `history` yet. The first frame itself is not included. In all these frames the same Gaussians are alive (opacity
-    /// ≥ alpha_min), so the frames can be counted together later. Used only by `MotionParams::Runs`.
+    /// Number of frames after the first whose opacities equal those of the first frame. They are not counted in
+    /// `steps`, `turns` and `history` yet. The same Gaussians are alive in all of them (opacity ≥ alpha_min), so they
+    /// are counted together later. Used only by `MotionParams::Runs`.
     steady: u32,
     /// Positions in the previous frame, x(t−1). The field `before` holds the positions one frame earlier, x(t−2). Shape
     /// `[3, len]` each.

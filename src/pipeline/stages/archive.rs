@@ -40,9 +40,9 @@ const NAME: &str = "archive";
 /// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
 /// coarser step would round nearly all values to the same number.
 const MAX_STEP: f64 = 4.0;
-/// Lower bound of the standard deviation from which the quantization step of an additional column is derived (values of
-/// the Gaussians beside the standard attributes). Unit: largest magnitude in the column. A column of equal values then
-/// keeps about the precision of f32.
+/// Smallest standard deviation from which the quantization step of a column is computed, as a fraction of the largest
+/// magnitude in the column. A column holds values of the Gaussians that belong to no attribute, such as velocities. If
+/// all values of a column are equal, this bound gives a step about as fine as the precision of f32.
 const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 /// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
 /// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this
