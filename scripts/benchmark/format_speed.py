@@ -5,8 +5,8 @@
     python3 scripts/benchmark/format_speed.py target/release/splatsieve DATA [--gaussians 500000] [--repeats 3]
 
 `convert` writes each format from a binary PLY with SH degree 3, and makes a PLY of it again. Reading and writing that PLY
-is counted with it. MB/s is the size of the float32 state, in units of 1e6
-bytes, divided by the processor seconds of the whole process with one thread (median of the repeats).
+is counted with it. MB/s is the size of the float32 state, in units of 1e6 bytes, divided by the processor seconds of
+the whole process with one thread (median of the repeats).
 scripts/generate_stream.py makes the Gaussians, which needs numpy. DATA is not used.
 """
 
