@@ -1,11 +1,14 @@
 //! Measures the time of the deformation field per Gaussian and frame, on one thread.
 //!
-//! Two synthetic fields have the shapes of real models: D-NeRF style (width 64, two levels of 32 channels; position,
-//! scale and rotation) and DyNeRF style (width 128, two levels of 16 channels; all five heads). For comparison, the
-//! original PyTorch code needs 2.3 to 3.1 µs and 4.6 µs on one core of the machine on which these benchmarks were first
-//! run. Positions alone are measured too, because the scan of a model without opacity deformation reads nothing else;
-//! and the derivative of a frame state by positions, which refinement needs in every step. The time per Gaussian and
-//! frame is the inverse of the throughput.
+//! Two synthetic fields have the shapes of real models:
+//! - D-NeRF: width 64, two levels of 32 channels, and heads for position, scale and rotation. The original PyTorch code
+//!   needs 2.3 to 3.1 µs per Gaussian and frame.
+//! - DyNeRF: width 128, two levels of 16 channels, and all five heads. The original PyTorch code needs 4.6 µs.
+//!
+//! The PyTorch times are for one core of the machine on which these benchmarks were first run. Two further cases are
+//! measured: positions alone (DyNeRF: and opacities), because the scan of a model reads nothing else, and the
+//! derivative of a frame state by positions, which refinement needs in every step. The time per Gaussian and frame is
+//! the inverse of the throughput that is printed.
 
 use std::path::Path;
 

@@ -1,17 +1,24 @@
-//! Measures the time of a frame state of the other model formats per Gaussian and frame, on one thread.
+//! Measures the time of computing a frame state per Gaussian and frame, on one thread, for model formats other than
+//! 4DGaussians.
 //!
-//! - `network`: the network of Deformable-3D-Gaussians with a time network, for 1024 Gaussians that are prepared once;
-//!   it makes 0.5 million multiplications. It is compared with a product of the same matrices by `matrixmultiply`,
-//!   without biases, ReLUs and sines.
-//! - `state`, if the trained models are available: complete frame states of Deformable-3D-Gaussians (which includes the
-//!   decomposition of a covariance), with screws; of SC-GS, with each Gaussian 64 times, because all Gaussians share the
-//!   network outputs for control nodes, which are computed for every time; of SpacetimeGaussians and FreeTimeGS, which
-//!   are polynomials and a temporal window; of native 4D Gaussians, which are slices of covariances, without and with
-//!   colors.
-//! - `open`: the time that a block of these takes once for all frames.
+//! The benchmarks `network/*` measure only the network of Deformable-3D-Gaussians, for 1024 Gaussians:
+//! - `d3g`: the network with a time network; the encoded positions are computed once. It makes 0.5 million
+//!   multiplications per Gaussian.
+//! - `d3g_slopes`: the derivatives of the network's outputs by the positions.
+//! - `bare_product`: for comparison, products of matrices of the same sizes by `matrixmultiply`, without biases, ReLUs
+//!   and sines.
+//!
+//! The benchmarks `state/*` measure complete frame states, if the trained models are available:
+//! - `d3g`: Deformable-3D-Gaussians; `d3g_6dof`: with motions as screws. Both include the decomposition of a
+//!   covariance.
+//! - `sc_gs`: SC-GS with 64 copies of each Gaussian. All Gaussians share the network outputs for the control nodes,
+//!   which are computed for every time.
+//! - `spacetime` and `free_time`: SpacetimeGaussians and FreeTimeGS, which are polynomials and a temporal window.
+//! - `native_4d`: native 4D Gaussians, which are slices of 4D covariances; `native_4d_colors`: with colors.
+//! - `native_4d_open`: the time of opening a block of native 4D Gaussians, which is needed once for all frames.
 //!
 //! `scripts/torch_speed.py` measures the same in PyTorch. Times are processor times, so other load on the machine does
-//! not count. The time per Gaussian and frame is the inverse of the throughput.
+//! not count. The time per Gaussian and frame is the inverse of the throughput that is printed.
 
 #[path = "../tests/models/mod.rs"]
 mod models;
@@ -31,7 +38,7 @@ use splatsieve::source::Ids;
 
 const BLOCK: usize = 1024;
 const WIDTH: usize = 256;
-/// Number of copies of each Gaussian of SC-GS.
+/// Number of copies of each Gaussian in the measured model of the format SC-GS.
 const REPEATED: usize = 64;
 /// Number of inputs of the network: the encoded position has 63 values, the encoded time 30.
 const INPUTS: usize = 63 + 30;
@@ -75,7 +82,7 @@ fn noise(seed: &mut u64) -> f32 {
     (*seed >> 40) as f32 / (1 << 23) as f32 - 1.0
 }
 
-/// Returns for every layer of the network its number of outputs and its number of inputs.
+/// Returns, for every layer of the network, the pair (number of outputs, number of inputs).
 fn layers() -> Vec<[usize; 2]> {
     let inputs = |k: usize| if k == 0 { INPUTS } else { WIDTH + if k == 5 { INPUTS } else { 0 } };
     (0..8).map(|k| [WIDTH, inputs(k)]).collect()
@@ -151,7 +158,7 @@ fn networks(criterion: &mut Criterion<Processor>) {
     group.finish();
 }
 
-/// Copies the model at `path` to `to` with each of its Gaussians [`REPEATED`] times.
+/// Copies the SC-GS model at `path` to the folder `to`, with each of its Gaussians [`REPEATED`] times. Returns `to`.
 fn repeated(path: &Path, to: &Path) -> PathBuf {
     for file in ["cfg_args", "deform/iteration_80000/deform.pth", "point_cloud/iteration_80000/point_cloud.ply"] {
         let mut bytes = fs::read(path.join(file)).expect("a trained model");

@@ -1,15 +1,22 @@
-//! Compares filters in front of zstd by attribute, on states of trained models.
+//! Compares filters that transform values before zstd compresses them, for each attribute, on states of trained models.
 //!
-//! Candidates: the bits unchanged, or zigzag differences of their ranks to the frame before (`order1`) or to the line
-//! through the two frames before (`order2`); in place, or with bytes of equal weight gathered (`shuffled`); zstd level
-//! 1 or 3. `gseq` uses the better order of each tile, shuffled, at the requested level; this benchmark is the reason
-//! for that choice. Sizes in percent of the raw bytes are printed as a Markdown table with one row per model and
-//! attribute; times are taken over all models.
+//! The first table has all combinations of these choices:
+//! - Values: the bits of each f32 unchanged (`order0`), or zigzag-coded differences. Before differences are taken, the
+//!   bits are mapped to integers in the order of the numbers. A difference is taken to the frame before (`order1`), or
+//!   to the line through the two frames before (`order2`).
+//! - Bytes: in place (`plain`), or grouped by significance (`shuffled`): first the lowest byte of every value, then the
+//!   next byte of every value, and so on.
+//! - zstd level 1 or 3.
 //!
-//! A second table compares encodings within an error bound: multiples of twice the bound, as differences to the frame
-//! before, of all tracks or only of those that move, frame by frame or track by track; and the encoding of `gseq`,
-//! which also uses half the step for tracks that do not move if that is smaller. The figures are raw bytes divided by
-//! stored bytes.
+//! `gseq` uses the better order of each tile, shuffled, at the requested level; this benchmark is the reason for that
+//! choice. Sizes in percent of the raw bytes are printed as a Markdown table with one row per model and attribute.
+//! Times are measured over all models together.
+//!
+//! A second table compares encodings within an error bound. Values are stored as multiples of twice the bound, and
+//! frames as differences to the frame before. Differences are stored for all tracks (one value of one Gaussian over
+//! time) or only for tracks that move, and frame by frame or track by track. The last columns are the encoding of
+//! `gseq`, which also tries half the step for tracks that do not move. The figures are raw bytes divided by stored
+//! bytes.
 //!
 //! Usage: `cargo bench --bench filters`; `cargo bench --bench filters -- decode/position` measures one attribute.
 
@@ -28,7 +35,8 @@ struct Filter {
     level: i32,
 }
 
-/// Returns every candidate filter: three orders of differences, bytes gathered or not, two compression levels.
+/// Returns every filter that is compared: differences of order 0 (none), 1 and 2; bytes in place or grouped by
+/// significance; zstd levels 1 and 3.
 fn filters() -> impl Iterator<Item = Filter> {
     let with = |order| {
         [(false, 1), (false, 3), (true, 1), (true, 3)].map(|(shuffled, level)| Filter { order, shuffled, level })
@@ -42,7 +50,8 @@ impl Filter {
         format!("order{}_{layout}_zstd{}", self.order, self.level)
     }
 
-    /// Encodes the values `bits` (bits of f32), which are frames of `plane` values each.
+    /// Returns the f32 values `bits` (as their bits) filtered and compressed. The values are frame after frame; each
+    /// frame has `plane` values.
     fn encode(&self, bits: &[u32], plane: usize) -> Vec<u8> {
         let mut residuals = bits.to_vec();
         if self.order > 0 {
@@ -91,24 +100,26 @@ impl Filter {
     }
 }
 
-/// Converts the bits of an f32 to an integer. Integers are in the same order as the numbers.
+/// Converts the bits of an f32 to an integer, so that the integers are in the same order as the numbers.
 fn rank(bits: u32) -> u32 {
     bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// Extrapolates the line through two frames to the next frame. `one` is the value one frame before, `two` the value two
-/// frames before. If both are equal, the result is the same value.
+/// Returns the value predicted for a frame: the linear extrapolation of `one`, the value one frame before, and `two`,
+/// an earlier value. If both are equal, the prediction is this value.
 fn predict(one: u32, two: u32) -> u32 {
     one.wrapping_mul(2).wrapping_sub(two)
 }
 
-/// Returns the two frames from which `frame` is predicted: the frame before it, and the frame `order` frames before it.
+/// Returns the values of the two frames from which `frame` is predicted: the frame before it, and the frame `order`
+/// frames before it. `before` has all frames before `frame`, with `plane` values each.
 fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u32], &[u32]) {
     let back = |k: usize| &before[(frame - k) * plane..][..plane];
     (back(1), back(order.min(frame)))
 }
 
-/// Returns the error bound of the attribute `column` in the table of encodings within a bound.
+/// Returns the error bound of the attribute `column` in the table of encodings within an error bound, in the unit of
+/// the attribute.
 fn bound(column: Attributes) -> f64 {
     match column {
         Attributes::POSITION => 1e-3,
@@ -118,9 +129,10 @@ fn bound(column: Attributes) -> f64 {
     }
 }
 
-/// Encodes the values as multiples of twice `bound`: one bit per track, the first frame, then differences between
-/// frames. Bytes of equal weight are gathered. With `apart`, only tracks that move have differences; with `by_track`,
-/// differences are stored track by track instead of frame by frame.
+/// Returns the f32 values `bits` (as their bits, frame after frame, `plane` values each) encoded as multiples of twice
+/// `bound`, uncompressed. A track is one value of one Gaussian over time. The result has one bit per track, the first
+/// frame, then differences between frames. Bytes are grouped by significance. With `apart`, only tracks that move have
+/// differences; with `by_track`, differences are stored track by track instead of frame by frame.
 fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool) -> Vec<u8> {
     let multiple = |&bits: &u32| (f64::from(f32::from_bits(bits)) / (2.0 * bound)).round() as i32;
     let values: Vec<i32> = bits.iter().map(multiple).collect();
@@ -143,10 +155,12 @@ fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool
     out
 }
 
-/// Bits of a tile, and the number of values in one frame.
+/// Values of a tile (values of one attribute that are encoded together) as bits of f32, and the number of values per
+/// frame.
 type TileBits = (Vec<u32>, usize);
 
-/// Returns the row of the attribute `column` in the table of encodings within an error bound.
+/// Returns the row of the scene `name` and the attribute `column` in the table of encodings within an error bound.
+/// `tiles` holds the values.
 fn within_bounds(name: &str, column: Attributes, tiles: &[TileBits]) -> String {
     let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
     let times =

@@ -1,10 +1,15 @@
-//! Measures how many Gaussians per second are linked to the frame before and joined across lives, on one thread and on
-//! all.
+//! Measures how many Gaussians per second tracking links to the frame before and joins over gaps, on one thread and on
+//! two.
 //!
-//! `still` repeats every Gaussian to the bit, `moving` moves each on its circle, `noisy` adds noise of 2% of its size,
-//! `lives` removes a seventh of them in each frame, and `crowded` puts fifty within the size of each. Frames have a
-//! shuffled order. For comparison, `nearest` searches all pairs in cells as wide as the mean distance and takes the
-//! nearest Gaussian, whatever its appearance; it shows the cost of the search without decisions.
+//! The cases differ in the frames, each of which has its Gaussians in another order:
+//! - `still` repeats every Gaussian to the bit.
+//! - `moving` moves each Gaussian on a circle of its own.
+//! - `noisy` adds noise to the positions, with a standard deviation of 2% of the size of a Gaussian.
+//! - `lives` also removes a seventh of the Gaussians in each frame.
+//! - `crowded` is `noisy` with fifty Gaussians within the size of each Gaussian, instead of four.
+//!
+//! For comparison, `nearest` searches all pairs in cells as wide as the mean distance and takes the nearest Gaussian,
+//! whatever its appearance. It shows the cost of the search alone.
 //!
 //! Usage: `cargo bench --bench link`. The goal is a million Gaussians per second and core.
 
@@ -23,9 +28,12 @@ fn uniform(k: u64) -> f32 {
     (hash_id(k) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Returns frames of a point cloud in shuffled order. About `crowd` Gaussians lie within the size of each Gaussian.
-/// `motion` is the angle in radians per frame on its circle, `noise` the noise of positions in sizes of a Gaussian;
-/// with `lives`, a seventh of the Gaussians is missing in each frame.
+/// Returns the frames of moving Gaussians, each frame in an order of its own. The typical size of the Gaussians follows
+/// from `crowd`: a cube with a side of twice this size holds about `crowd` Gaussians.
+///
+/// - `motion`: angle in radians by which each Gaussian moves on its circle per frame.
+/// - `noise`: width of the uniform noise of positions, as a multiple of the typical size.
+/// - `lives`: whether a seventh of the Gaussians is missing in each frame.
 fn frames(crowd: f32, motion: f32, noise: f32, lives: bool) -> Vec<Gaussians> {
     let size = (crowd / COUNT as f32).cbrt() * 0.5;
     let frame = |t: usize| {

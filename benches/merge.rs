@@ -1,14 +1,18 @@
 //! Measures the cost of merging on one thread.
 //!
-//! - `neighbors`: time per Gaussian of finding the nearest neighbors within ε. `voxels` is the index of the program,
-//!   built and searched: in trained models with the ε of the presets, among evenly distributed Gaussians with few or many
-//!   neighbors, in clusters, and in crowds (all in one voxel, and all at one point). It is compared with `tree`, one tree
-//!   over all points searched in voxel order, which the program used earlier; with `all_pairs`, only for few Gaussians;
-//!   and with `plain_hash`, whose voxels list their points and are looked up for each point.
+//! The benchmarks `neighbors` measure the time per Gaussian of finding the nearest neighbors within the radius ε. The
+//! inputs are trained models with ε of the presets, evenly distributed Gaussians with few or many neighbors (`strewn`),
+//! clusters, and crowds (all in one voxel, or all at one point). Four methods are compared:
+//! - `voxels`: the index that the program uses, built and searched.
+//! - `tree`: one tree over all points, searched in voxel order, which the program used earlier.
+//! - `all_pairs`: comparison of all pairs; only for few Gaussians.
+//! - `plain_hash`: a hash table of voxels with lists of their points; the voxels are looked up for each point.
+//!
+//! The other benchmarks measure the motion test and a complete pass:
 //! - `pairs`: time per pair and frame of measuring the motion of a pair, with positions in memory.
-//! - `measure`: the same from a packed container, at once and in eight partitions; the difference is the cost of
-//!   gathering and reading again.
-//! - `merge`: time per survivor of a complete pass without motion: neighbors, tests, clusters, proxies.
+//! - `measure`: the same with positions read from a compressed container. The pairs are measured at once or in eight
+//!   partitions. The difference is the cost of writing all trajectories to a scratch file and reading them again.
+//! - `merge`: time per survivor of one merging pass without motion: neighbors, tests, clusters, proxies.
 //!
 //! Usage: `cargo bench --bench merge`
 
@@ -39,15 +43,15 @@ use splatsieve::progress::Events;
 use splatsieve::recipe::{MotionParams, Recipe};
 use splatsieve::source::FrameSource;
 
-/// Maximum number of neighbors of a Gaussian that the presets use.
+/// Maximum number of neighbors per Gaussian that a search returns, as in the presets of the recipe.
 const NEIGHBORS: usize = 32;
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// Returns `n` similar Gaussians distributed evenly over the unit cube, and a radius that contains a few neighbors of
-/// each.
+/// Returns `n` similar Gaussians distributed evenly over the unit cube, and a radius within which each has a few
+/// neighbors.
 fn evenly_distributed(n: usize) -> (Gaussians, f64) {
     let mut states = Gaussians::zeros(n, 0);
     let spacing = (n as f64).powf(-1.0 / 3.0);
@@ -61,7 +65,8 @@ fn evenly_distributed(n: usize) -> (Gaussians, f64) {
     (states, 1.2 * spacing)
 }
 
-/// Neighbor search that is measured: takes positions and the radius ε, returns the total number of neighbors found.
+/// Function that searches the neighbors of every position, by one of the compared methods. The arguments are the
+/// positions and the radius ε; the result is the total number of neighbors found.
 type Find = fn(&AttributeValues, f64) -> usize;
 
 fn points(position: &AttributeValues) -> Vec<TreePoint> {
@@ -92,7 +97,8 @@ fn squared(a: [f32; 3], b: [f32; 3]) -> f64 {
     (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum()
 }
 
-/// Keeps the nearest [`NEIGHBORS`] entries of `near` (squared distance, index). Returns the number of entries kept.
+/// Removes all entries of `near` except the nearest [`NEIGHBORS`]. An entry is a pair (squared distance, index of a
+/// point). Returns the number of remaining entries.
 fn nearest(near: &mut Vec<(f64, u32)>) -> usize {
     near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(NEIGHBORS);
@@ -144,8 +150,8 @@ fn clustered(n: usize) -> AttributeValues {
     position
 }
 
-/// Returns the extent of a scene: the largest side of the box between the 1st and the 99th percentile of each
-/// coordinate.
+/// Returns the extent of the points `position`: the largest side of the box between the 1st and the 99th percentile of
+/// each coordinate.
 fn extent(position: &AttributeValues) -> f64 {
     let side = |c: usize| {
         let mut plane = position.plane(c).to_vec();

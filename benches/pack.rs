@@ -1,13 +1,20 @@
-//! Measures how fast tiles of a container are encoded and decoded, per (Gaussian, frame), on one thread.
+//! Measures how fast tiles of a container are encoded and decoded, per (Gaussian, frame), on one thread. A tile has the
+//! values of one attribute for some Gaussians at some frames.
 //!
 //! The inputs are generated curves and states of the trained models (skipped if they are missing), all varying
-//! attributes. Each group is compared with zstd at the same level on the same bytes without a filter, and with copying
-//! them. `encode/tile` is the codec alone, `encode/container` all of packing: states gathered into tiles, encoded,
-//! written, synced. `decode/tile` reads, verifies and decodes from the page cache, `decode/raw` copies raw tiles from
-//! there; `bounded` does the same with tiles within a bound of 0.001 in every attribute, with the zstd level that
-//! `pack` uses for them. The stored sizes are printed before each scene.
+//! attributes.
+//! - `encode/tile`: the codec alone. `encode/container`: all of packing, that is, states are gathered into tiles,
+//!   encoded, written and synced to disk.
+//! - `decode/tile`: tiles are read from the page cache, verified and decoded. `decode/raw`: uncompressed tiles are
+//!   copied from the page cache.
+//! - `bounded`: encoding or decoding within an error of 0.001 in every attribute, at the zstd level that `pack` uses
+//!   for error bounds.
+//! - `plain_zstd`: for comparison, zstd at the same level on the same bytes without a filter. `memcpy`: copying of
+//!   these bytes.
 //!
-//! Usage: `cargo bench --bench pack`. The time per (Gaussian, frame) is the inverse of the throughput.
+//! The stored sizes are printed before each scene.
+//!
+//! Usage: `cargo bench --bench pack`. The time per (Gaussian, frame) is the inverse of the throughput that is printed.
 
 mod trajectories;
 
@@ -26,7 +33,8 @@ use splatsieve::source::FrameSource;
 const LEVEL: i32 = 1;
 const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 
-/// Returns every tile of the attributes that vary with time: its number of components per Gaussian, and its values.
+/// Returns every tile of the attributes that vary with time, as a pair: number of components per Gaussian, and values.
+/// A tile has the values of one attribute for some Gaussians at all frames.
 fn all_tiles(scene: &FramesInMemory) -> Vec<(u32, Vec<f32>)> {
     let info = scene.info();
     let tiles_with_width = |column: Attributes| {

@@ -1,8 +1,9 @@
-//! Measures how many (Gaussian, view) projections per second one core makes.
+//! Measures how many projections of a Gaussian into a view one core makes per second.
 //!
-//! A block of 16,384 Gaussians, with the four needed attributes decoded once, is projected into 16 cameras: the inner
-//! loop of the scan for a multi-view data set. `scan/1 view` adds the decoding of every attribute in every frame, the
-//! worst case of a monocular capture.
+//! - `scan/16 views`: a block of 16,384 Gaussians is projected into 16 cameras, and its four needed attributes are
+//!   decoded once. This is the inner loop of the scan for a data set with several cameras.
+//! - `scan/1 views`: one camera, and every attribute counts as changed in every frame. This is the worst case, a
+//!   capture with one moving camera.
 //!
 //! Usage: `cargo bench --bench projection`
 

@@ -1,12 +1,14 @@
-//! Measures the time of a render and of a render with its gradients: 10,000 to a million synthetic Gaussians of SH degree
-//! 3, images of three sizes, one thread and all threads. Prints CSV with the median, the smallest and the largest time.
+//! Measures the time of a render, and of a render with its gradients: the derivatives of the squared error of the image
+//! by every attribute of every Gaussian. The inputs are 10,000 to a million synthetic Gaussians of SH degree 3, images
+//! of three sizes, and one thread or all threads. Prints CSV with the median, the smallest and the largest time.
 //!
-//! `scripts/benchmark/rasterizer.py` runs it and writes docs/benchmarks/rasterizer.csv. Beside each row stand the blend
-//! events (pixels that a Gaussian changes), the shortest time for their arithmetic on one core, and the time of the plain
-//! scalar reference: the renderer in f64 that the tests compare with, without vectors and without tiles. The gradients are
-//! those of the squared error by every attribute of every Gaussian.
+//! Each row also has, for comparison:
+//! - the number of blend events (pairs of a pixel and a Gaussian that changes it);
+//! - the shortest possible time for their arithmetic on one core;
+//! - the time of the scalar reference, the slow f64 renderer that the tests compare with.
 //!
-//! `cargo bench --bench rasterizer -- 200000` measures only this number of Gaussians.
+//! `scripts/benchmark/rasterizer.py` runs this benchmark and writes docs/benchmarks/rasterizer.csv. `cargo bench
+//! --bench rasterizer -- 200000` measures only this number of Gaussians.
 
 mod synthetic;
 
@@ -22,9 +24,9 @@ use synthetic::{blend_limit, cloud};
 
 /// Widths and heights of the images in pixels.
 const SIZES: [[u32; 2]; 3] = [[320, 240], [800, 800], [1352, 1014]];
-/// Numbers of Gaussians.
+/// Numbers of Gaussians for which renders are measured.
 const COUNTS: [usize; 4] = [10_000, 50_000, 200_000, 1_000_000];
-/// Number of timed renders; their median is printed.
+/// Number of timed renders for each row of the output.
 const RENDERS: usize = 5;
 
 fn main() {
@@ -54,7 +56,7 @@ fn main() {
     }
 }
 
-/// Prints the rows of one image: one thread, then all threads.
+/// Measures renders of `gaussians` from `camera` and prints two rows of the CSV: for one thread, and for all threads.
 fn measure(gaussians: &Gaussians, camera: &Camera) {
     let start = Instant::now();
     let events = oracle::render_view(gaussians, camera, [0.0; 3], 1).events as f64;
@@ -78,8 +80,8 @@ fn measure(gaussians: &Gaussians, camera: &Camera) {
     }
 }
 
-/// Returns the sorted times in milliseconds of renders, and of renders with gradients, measured in alternation so that
-/// other load on the machine slows both.
+/// Returns two lists of times in milliseconds, each sorted: of renders, and of renders with gradients. Both are
+/// measured in alternation, so that other load on the machine slows both.
 fn times(renderer: &mut Renderer, gaussians: &Gaussians, camera: &Camera) -> ([f64; RENDERS], [f64; RENDERS]) {
     let target = renderer.render(gaussians, camera, [0.5; 3]);
     let squared_error = |image: &Image| {
@@ -101,7 +103,7 @@ fn times(renderer: &mut Renderer, gaussians: &Gaussians, camera: &Camera) -> ([f
     (render, gradient)
 }
 
-/// Returns the median, the smallest and the largest of sorted times as three columns.
+/// Formats the median, the smallest and the largest of the sorted `times` as three columns of CSV.
 fn in_columns(times: &[f64; RENDERS]) -> String {
     format!("{:.2},{:.2},{:.2}", times[RENDERS / 2], times[0], times[RENDERS - 1])
 }

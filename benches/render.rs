@@ -1,26 +1,32 @@
-//! Measures the time of a render on one core, its parts, its distance from the limits of the machine, and its growth
-//! from 10,000 to a million Gaussians; the cost of scoring one (Gaussian, frame, view) with and without a pixel stride;
-//! and the cost of a render with its gradients.
+//! Measures the time of a render on one core, of scoring (finding the contributions of all Gaussians to a view), and of
+//! a render with its gradients.
 //!
-//! `picture/*` renders and scores one view of each trained model, with its frame state given (skipped if the models are
-//! missing); the goal is 25 ms for `room2_big`. `picture/large` is a 1352×1014 view of 200,313 Gaussians:
-//! `room2_dynerf` with each Gaussian split into nine. `size/*` does the same for synthetic point clouds in a 640×512
-//! image. The throughput that criterion prints is in Gaussians per second, so for `score` its inverse is the cost of
-//! one (Gaussian, frame, view). Before each group the benchmark prints the numbers of Gaussians, pixels and blend
-//! events of the render (pixels that a Gaussian changed, counted by the oracle of the tests), and how many of each per
-//! second at the median time of some renders. For comparison, the C++ AVX-512 port of the original rasterizer takes 26,
-//! 14 and 12 ms for `room2_big`, `room2_dynerf` and `deform2`, measured elsewhere.
+//! The images are:
+//! - `picture/*`: one view of each trained model, with its frame state given (skipped if the models are missing). The
+//!   goal is 25 ms for the render of `room2_big`. The C++ AVX-512 port of the original rasterizer takes 26, 14 and 12
+//!   ms for `room2_big`, `room2_dynerf` and `deform2`, measured elsewhere.
+//! - `picture/large`: a 1352×1014 view of 200,313 Gaussians: `room2_dynerf` with each Gaussian split into nine.
+//! - `picture/demo`: a view of the demo scene.
+//! - `size/*`: 10,000 to a million synthetic Gaussians in a 640×512 image.
 //!
-//! The parts of a render are differences of medians, measured in alternation, of renders that lack one part after the
-//! other. Their lower bounds are printed beside them: for the blend, [`blend_limit`]; for the rest, the bytes that must be
-//! moved at the measured memory bandwidth.
+//! The benchmarks of an image are:
+//! - `render`: the render alone.
+//! - `gradient`: the render with the derivative of its squared error by every stored value. The goal is 2.6 times the
+//!   render alone; `picture/large` misses it with 2.7. The ratio of the median times is printed before each group. It
+//!   includes the subtraction of two images for the loss.
+//! - `score_every_1`, `_2` and `_4`: scoring on every pixel, or every second or fourth in each direction.
 //!
-//! The goal for `gradient`, a render with the derivative of its squared error by every stored value, is 2.6 times the
-//! render alone; `picture/large` misses it with 2.7. The ratio of medians, measured in alternation, is printed before
-//! each group. It includes the subtraction of two images for the loss. `picture/demo` is a view of the demo scene.
+//! The throughput that criterion prints is in Gaussians per second, so the inverse of it is the cost of one (Gaussian,
+//! frame, view). Before each group the benchmark also prints the numbers of Gaussians, pixels and blend events (pairs
+//! of a pixel and a Gaussian that changed it, counted by the oracle of the tests), and how many of each are processed
+//! per second at the median time.
 //!
-//! Times are wall-clock times: on a busy machine they are several times the cost. Criterion arguments filter:
-//! `cargo bench --bench render -- picture`.
+//! The times of the parts of a render are differences between medians of renders that lack one part after the other,
+//! measured in alternation. Lower bounds are printed below them: for the blend, [`blend_limit`]; for all other parts,
+//! the bytes that must be moved at the measured memory bandwidth.
+//!
+//! Times are wall-clock times: on a busy machine they are several times the cost. Criterion arguments filter: `cargo
+//! bench --bench render -- picture`.
 
 #[path = "../tests/models/mod.rs"]
 mod models;
@@ -40,11 +46,12 @@ use splatsieve::source::{FrameSource, Ids};
 
 use synthetic::{blend_limit, cloud, fastest};
 
-/// Number of renders for each median time. The medians give the printed rates, and the ratio of a render with gradients
-/// to a render without.
+/// Number of renders from which each median time is computed. The printed rates, and the ratio of a render with
+/// gradients to a render without, follow from these medians.
 const PICTURES: usize = 21;
 
-/// Measures rendering, scoring and gradients of one view of the Gaussians `state`, as benchmark `name` of `group`.
+/// Measures rendering, scoring and gradients of the Gaussians `state` seen from `camera`, as the benchmark `name` of
+/// the group `group`.
 fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians, camera: &Camera) {
     let events = oracle::render_view(state, camera, [0.0; 3], 1).events;
     let (count, pixels) = (state.len(), u64::from(camera.width) * u64::from(camera.height));
@@ -94,7 +101,8 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     group.finish();
 }
 
-/// Prints the cost of the parts of a render with `events` blend events, and their lower bounds.
+/// Prints the time of the parts of one render (project, sort, harmonics, blend), and lower bounds for the blend and for
+/// the memory traffic. `events` is the number of blend events: pairs of a pixel and a Gaussian that changes it.
 fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, events: f64) {
     let gray = Gaussians { sh: Gaussians::zeros(state.len(), 0).sh, ..state.clone() };
     let empty = Camera { width: 0, height: 0, ..camera.clone() };
@@ -170,11 +178,11 @@ fn pictures(criterion: &mut Criterion) {
     }
 }
 
-/// Splits every Gaussian into nine smaller ones in a grid along its first two axes. Together they are about as opaque
-/// as the original.
+/// Returns `state` with every Gaussian replaced by nine smaller ones, in a grid along its first two axes. Together they
+/// are about as opaque as the original.
 fn split(state: &Gaussians) -> Gaussians {
-    /// Distance between the nine Gaussians, in standard deviations of the original. Each has √⅓ of its standard
-    /// deviation, so that the variances add up.
+    /// Distance between neighbors among the nine Gaussians, in standard deviations of the original Gaussian. The
+    /// standard deviation of each is √⅓ of the original's, so that the total variance equals that of the original.
     const APART: f32 = 1.0;
     let parents: Vec<u32> = (0..9 * state.len() as u32).map(|child| child / 9).collect();
     let mut children = state.pick(&parents);

@@ -1,21 +1,25 @@
-//! Measures the cost of the scan of a container per Gaussian and frame.
+//! Measures the cost of the scan, the pass that reads all frames of a container, per Gaussian and frame.
 //!
-//! First, the cost beyond reading, on one thread. There are no views, so the scan consists of life span, motion and the
-//! search for NaN. `packed/*` is compared with `decode`, which decodes the same tiles and drops them; the goal is 80%
-//! of its speed. Two more figures put `decode` in relation: `zstd` decompresses the same values, compressed without a
-//! filter at the same level, and `copy` copies them. In `raw/*` the tiles lie in the page cache, and are compared with
-//! plain sums over the same bytes: of f32 one after the other, and of u32, which is as fast as memory; the goal is half
-//! the speed of the first. `position` varies alone, or with rotation, scale and opacity; the constant attributes are
-//! read once.
+//! The first benchmarks measure how much the scan takes beyond reading, on one thread. There are no views, so the scan
+//! consists of life span, motion and the search for NaN. Attributes vary in two ways: `position` alone, or
+//! `all_but_sh`; attributes that do not vary are read once.
+//! - `packed/scan`: scan of compressed tiles. It is compared with `packed/decode`, which only decodes the same tiles;
+//!   the goal is 80% of its speed. `packed/zstd` decompresses the same values, compressed without a filter at the same
+//!   level, and `packed/copy` copies them.
+//! - `raw/scan`: scan of uncompressed tiles in the page cache. It is compared with plain sums over the same bytes:
+//!   `raw/sum_f32`, of f32 one after the other, and `raw/sum_u32`, which is as fast as memory. The goal is half the
+//!   speed of `raw/sum_f32`.
 //!
-//! Second, ways to read ahead, on all threads: in `blocks` every thread reads a block of Gaussians and announces its
-//! next frame block; `stages` fetches, decodes and accumulates on separate threads. `warm_*` reads from the page cache;
-//! `cold_*` drops the file from the page cache first (Linux); `slow_*` simulates a disk of [`SLOW`] bytes per second,
-//! for which both ways wait as for a real one.
+//! The second benchmarks compare two ways to read ahead, on all threads. In `blocks`, every thread reads a block of
+//! Gaussians and announces its next frame block. In `stages`, separate threads fetch, decode and accumulate.
+//! - `warm_*` reads from the page cache.
+//! - `cold_*` drops the file from the page cache first (Linux).
+//! - `slow_*` simulates a disk of [`SLOW`] bytes per second, for which both ways wait as for a real one.
 //!
-//! Third, the cost of using raw tiles in place, on all threads: `raw_frames/*` copies every frame to a state of the
-//! caller. `ordinary` uses positioned reads; the others use the memory map and release its pages once per frame block
-//! of a Gaussian block, frame by frame, or never, in which case the whole file becomes resident.
+//! The third benchmarks, `raw_frames/*`, copy every frame of uncompressed tiles to a state of the caller, on all
+//! threads. `ordinary` uses positioned reads. The others use a memory map and differ in when they release its pages:
+//! `released_by_block` once per frame block of a Gaussian block, `released_by_frame` after every frame, and
+//! `left_mapped` never, so that the whole file becomes resident.
 //!
 //! Usage: `cargo bench --bench scan`
 
@@ -85,8 +89,8 @@ impl BlockReader for CurveReader {
     }
 }
 
-/// Decodes every tile that a scan reads and passes its values to `take`: all tiles of attributes that vary with time,
-/// and the tiles of the first frame block of all others.
+/// Decodes every tile that a scan reads, and passes its values to `take`. These are all tiles of the attributes
+/// `varying`, and of all other attributes only the tiles of the first frame block.
 fn each_tile(reader: &Reader, varying: Attributes, mut take: impl FnMut(&[f32])) {
     let mut buffer = TileBuffer::default();
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
@@ -169,7 +173,8 @@ fn benches(criterion: &mut Criterion) {
 struct Disk(Mutex<Instant>);
 
 impl Disk {
-    /// Requests `bytes`. Returns the time at which they are available.
+    /// Requests `bytes` bytes from the simulated disk, after all earlier requests. Returns the time at which the bytes
+    /// are available.
     fn order(&self, bytes: u64) -> Instant {
         let mut busy = self.0.lock().unwrap();
         *busy = (*busy).max(Instant::now()) + Duration::from_secs_f64(bytes as f64 / SLOW);
@@ -181,8 +186,8 @@ fn wait_for(ready: Instant) {
     thread::sleep(ready.saturating_duration_since(Instant::now()));
 }
 
-/// Container that is read with stages on separate threads (`in_stages`) or by blocks, directly or through the simulated
-/// disk.
+/// Container whose frames are read in one of two ways: with fetching, decoding and accumulating on separate threads
+/// (`in_stages`), or block by block on every thread. Reads wait for the simulated disk if `disk` is set.
 struct BenchSource<'a> {
     container: &'a Container,
     in_stages: bool,
@@ -241,13 +246,13 @@ impl Prefetch for BenchSource<'_> {
     }
 }
 
-/// Reader that waits for the simulated disk. It waits for the whole first frame block. Every later frame block was
-/// requested in advance, so it waits only for the time that is still missing.
+/// Reader of a block of Gaussians that waits for the simulated disk. For the first frame block it waits the full time.
+/// It requests every later frame block in advance, and so waits only for the remaining time.
 struct WaitingReader<'a> {
     fed: &'a BenchSource<'a>,
     gaussians: Range<usize>,
     reader: Box<dyn BlockReader + 'a>,
-    /// Frame block that was requested in advance, and the time at which it is available.
+    /// First frame of the frame block that was requested in advance, and the time at which its bytes are available.
     coming: Option<(usize, Instant)>,
 }
 
@@ -270,7 +275,7 @@ impl BlockReader for WaitingReader<'_> {
     }
 }
 
-/// Drops a file from the page cache.
+/// Removes the file at `path` from the page cache of the operating system.
 #[cfg(target_os = "linux")]
 fn drop_cached(path: &Path) {
     let of = format!("of={}", path.display());
@@ -315,7 +320,7 @@ fn read_ahead(criterion: &mut Criterion) {
     }
 }
 
-/// Measures copying every frame of raw tiles to a state of the caller.
+/// Measures the copying of every frame from uncompressed tiles to a state of the caller, for the attributes `varying`.
 fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Attributes) {
     let columns: Vec<(u32, usize)> = Attributes::all()
         .iter()

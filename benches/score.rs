@@ -1,10 +1,15 @@
-//! Measures the cost of a value in the percentiles that normalize scores, on one thread.
+//! Measures the time per value of computing the 1st and the 99th percentile of N values, by which scores are
+//! normalized, on one thread.
 //!
-//! `sketch` counts N values and reads them twice more for the buckets of P1 and P99, as the program does; `count` is
-//! the first of the three passes alone. They are compared with sorting a copy of the values, and with selecting both
-//! ranks in it without sorting. Values are log-normal, like scores, with 10% zeros.
+//! - `sketch`: the method of the program. It counts the values in buckets, then reads them twice more, for the buckets
+//!   of the two percentiles.
+//! - `count`: only the first of these three passes.
+//! - `sort`: sorts a copy of the values.
+//! - `select`: selects both percentiles in a copy without sorting it.
 //!
-//! Usage: `cargo bench --bench score`. The time per value is the inverse of the throughput.
+//! Values are log-normal, like scores, with 10% zeros.
+//!
+//! Usage: `cargo bench --bench score`. The time per value is the inverse of the throughput that is printed.
 
 use std::hint::black_box;
 
@@ -21,7 +26,7 @@ fn value(k: usize) -> f64 {
     (2.0 * normal - 5.0).exp()
 }
 
-/// Returns the index of the `p`-th percentile of `len` sorted values.
+/// Returns the index at which a sorted list of `len` values has its `p`-th percentile.
 fn percentile_index(p: usize, len: usize) -> usize {
     (p * len).div_ceil(100).max(1) - 1
 }

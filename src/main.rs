@@ -1,4 +1,4 @@
-//! The `splatsieve` command.
+//! Entry point of the program `splatsieve`. The module `cli` parses the command line and runs the command.
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout, clippy::disallowed_methods))]
 

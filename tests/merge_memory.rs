@@ -26,8 +26,9 @@ static ALLOCATOR: memory::Counting = memory::Counting;
 const COUNT: usize = 20_000;
 const FRAMES_HELD: usize = 2;
 
-/// Measures the pairs of every Gaussian with its six nearest neighbors. Returns the largest number of bytes allocated
-/// at any time, less the bytes allocated before, and the number of pairs.
+/// Measures the motion of pairs in a scene of `frames` frames, divided into `partitions` calls. The pairs are those of
+/// every Gaussian with its six nearest neighbors. Returns two results: the peak of the allocated memory, less the
+/// memory allocated before, in bytes; and the number of pairs.
 fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let path = folder.join(format!("{frames}.gseq"));
     if !path.exists() {

@@ -1,24 +1,24 @@
-//! Synthetic Gaussians and limits of the machine, for the benchmarks of the rasterizer.
+//! Synthetic Gaussians for the benchmarks of the rasterizer, and the lower bound of a blend's time on this machine.
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use splatsieve::model::Gaussians;
 
-/// Number of operations of the blend on one vector of pixels, without loads and stores: 6 from position to exponent, 20
-/// for the power of 2, 10 from there to weight and transmittance, 6 for the color.
+/// Number of vector operations that blend one Gaussian into one vector of pixels, without loads and stores: 6 from
+/// position to exponent, 20 for the power of 2, 10 from there to weight and transmittance, 6 for the color.
 const OPERATIONS: f64 = 42.0;
-/// Number of pixels in the widest vector.
+/// Number of pixels that the widest vector register holds.
 const LANES: f64 = 16.0;
 
-/// Returns the shortest time in seconds in which one core can do the arithmetic of `events` blend events (pixels that a
-/// Gaussian changes), at two vector operations per cycle of the measured clock.
+/// Returns the shortest time in seconds in which one core can do the arithmetic of `events` blend events (a blend event
+/// is a pixel and a Gaussian that changes it). Assumes two vector operations per cycle of the measured clock.
 pub(crate) fn blend_limit(events: f64) -> f64 {
     events / LANES * OPERATIONS / 2.0 / clock()
 }
 
-/// Returns the clock rate in cycles per second. It is measured with a chain of exclusive ors and integer products,
-/// which take one and three cycles.
+/// Returns the clock rate of the processor in cycles per second. It is measured with a chain of dependent operations:
+/// an exclusive or takes one cycle, an integer product three.
 fn clock() -> f64 {
     const LINKS: u32 = 10_000_000;
     fastest(|| {
@@ -28,7 +28,8 @@ fn clock() -> f64 {
     })
 }
 
-/// Calls `amount` several times, which works and returns the amount of its work. Returns the highest amount per second.
+/// Calls `amount` seven times. The function does some work and returns the amount of it, such as a number of bytes.
+/// Returns the highest amount per second.
 pub(crate) fn fastest(amount: impl Fn() -> f64) -> f64 {
     let rate = |_| {
         let start = Instant::now();

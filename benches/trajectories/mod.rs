@@ -1,4 +1,5 @@
-//! Inputs of the container benchmarks: states of Gaussians over some frames, from trained models and generated.
+//! Inputs of the benchmarks of containers: states of Gaussians over some frames, from trained models and from generated
+//! curves.
 
 use std::path::Path;
 
@@ -12,19 +13,19 @@ use splatsieve::source::{FrameSource, Ids};
 mod models;
 
 const GAUSSIANS: usize = 4096;
-/// Number of frames in a tile. They follow one another as the frames of the training do.
+/// Number of frames per tile (values that are encoded together) of a scene. The frames follow one another in time.
 const FRAMES: usize = 32;
 const TIMES: usize = 60;
 
-/// Returns every scene by name: generated curves, and the trained models if they are available.
+/// Returns every input scene with its name: generated curves, and the trained models if they are available.
 pub(crate) fn scenes() -> Vec<(&'static str, FramesInMemory)> {
     let models =
         models::found().into_iter().flat_map(|folder| models::NAMES.map(|name| (name, trained(&folder, name))));
     std::iter::once(("curves", curves())).chain(models).collect()
 }
 
-/// Returns the states over [`FRAMES`] frames of the trained model `name`, for Gaussians evenly spread over the point
-/// cloud. Attributes that do not vary with time are left out.
+/// Returns the states of [`FRAMES`] frames of the trained model `name` in `folder`, for Gaussians evenly spread over
+/// the point cloud. Attributes that do not vary with time are zero.
 fn trained(folder: &Path, name: &str) -> FramesInMemory {
     let times = (0..TIMES).map(|t| t as f64 / TIMES as f64).collect();
     let model = ModelFolder::open(&folder.join(name), None).unwrap().with_times(times).unwrap();
@@ -43,7 +44,8 @@ fn trained(folder: &Path, name: &str) -> FramesInMemory {
     held
 }
 
-/// Returns smooth curves with 1e-4 of noise in every attribute except SH.
+/// Returns a generated scene in which every attribute except SH follows smooth curves of amplitude 1, with noise of
+/// 1e-4.
 fn curves() -> FramesInMemory {
     let random = |k: usize| (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32;
     let varying = Attributes::all().difference(Attributes::SH);

@@ -40,7 +40,7 @@ const VALUES_PER_EXCEPTION: usize = 16;
 const MAX_MULTIPLE: f64 = (1 << 28) as f64;
 /// zstd level of a trial compression. The trial decides whether static tracks (components of a Gaussian whose values in
 /// all frames are stored as one number) use half the quantization step. Half the step makes more tracks static, but
-/// each of them takes a bit more space.
+/// doubles the numbers that are stored for them, and larger numbers take more space.
 const TRIAL_LEVEL: i32 = 1;
 
 /// Encoded tile whose decoded values differ from the original ones by at most the error bound.
@@ -172,8 +172,8 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Keeps the first frame only: drops the multiples and exceptions (values stored with their original bits) of all
-    /// later frames.
+    /// Keeps the first frame only, for a tile whose frames are all equal: drops the multiples and exceptions (values
+    /// stored with their original bits) of all later frames.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
@@ -387,8 +387,9 @@ mod tests {
         Ok(values)
     }
 
-    /// Generates tiles with tracks (components of a Gaussian) that are constant, drift, jitter or jump; some tiles have
-    /// one value of arbitrary bits.
+    /// Generates tiles, as (number of frames, number of values per frame, values of one frame after the other). Their
+    /// tracks (components of a Gaussian over the frames) are constant, drift, jitter or jump; some tracks have one
+    /// value of arbitrary bits.
     fn tiles() -> impl Strategy<Value = (usize, usize, Vec<f32>)> {
         let track = |frames: usize| {
             let from = prop_oneof![-3.0f32..3.0, -2e5f32..2e5, Just(0.0)];
@@ -471,7 +472,7 @@ mod tests {
         assert!(encode(&far, 64, 1e-3, 1).unwrap().is_none(), "no multiple is near");
     }
 
-    /// Checks that forged bytes are refused and never cause a panic.
+    /// Checks that lossy tiles with forged bytes are refused, and that no flipped bit causes a panic.
     #[test]
     fn forged_bytes_are_refused() {
         let values: Vec<f32> = (0..8 * 64).map(|i| (i as f32 * 0.37).sin()).collect();

@@ -62,7 +62,7 @@ pub enum Encoding {
     },
     /// Lossy: integer multiples of a step, as differences from a prediction, shuffled and compressed by zstd.
     Bounded {
-        /// Number of earlier frames from which a multiple is predicted: 1 or 2.
+        /// Number of earlier frames from which a multiple of the step is predicted: 1 or 2.
         order: u8,
     },
 }

@@ -55,9 +55,8 @@ impl Index {
         }
     }
 
-    /// Checks all entries of the index, adds them to `digest`, and returns for every column whether its values differ
-    /// between frames.
-    ///
+    /// Checks all entries of the index and adds them to `digest`, the hash of the content. Returns for every column
+    /// whether its values differ between frames. `chunk` is a buffer for reading.
     /// Also checks that no two tiles overlap in the file; constant tiles (all frames equal) may share all of their
     /// bytes. If the tiles do not lie in the order of the index, the check takes more memory, at most `memory` bytes.
     pub(crate) fn check(
@@ -78,12 +77,13 @@ impl Index {
         Ok(varies)
     }
 
-    /// Checks and hashes all entries in one pass over the index. Returns
+    /// Checks all entries in one pass over the index, and adds them to `digest`, the hash of the content. Returns
     /// - for every column, whether its values differ between frames,
     /// - whether the pass has shown that no two tiles overlap in the file. It shows this only if the tiles lie in the
     ///   file in the order of the index.
     ///
-    /// The pass remembers only the last constant tile (all frames equal) of each column and Gaussian block.
+    /// The pass remembers only the last constant tile (all frames equal) of each column and Gaussian block. `chunk` is
+    /// a buffer for reading.
     fn check_entries(
         &self,
         file: &MappedFile,

@@ -46,7 +46,8 @@ pub struct ColumnSpec {
     pub max_error: f64,
 }
 
-/// Shape of a container, except for the number of frames, which may be unknown when writing begins.
+/// Shape and text attributes of a container. The shape is the number of Gaussians, the columns, and the block lengths.
+/// The number of frames is not included, because it may be unknown when writing begins.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layout {
     /// Number N of Gaussians in every frame; 0 to 2³².

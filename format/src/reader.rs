@@ -449,7 +449,8 @@ fn read_stored(file: &MappedFile, tile: &TileRecord, stored: &mut Vec<u8>) -> Re
     check_payload(tile, xxh3_64(stored)).map_err(|fault| fault.at(file.path()))
 }
 
-/// Decompresses `stored`, the stored bytes of a tile that is not raw, so that `frames` can decode its frames.
+/// Decompresses the tile with the index entry `tile`, which is not raw, from its stored bytes `stored` into the decoder
+/// `frames`, which can then decode its frames. Creates the decompressor `zstd` if it is `None`.
 fn decompress(
     file: &MappedFile,
     layout: &Layout,
@@ -496,9 +497,9 @@ fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fa
     Err(Fault::new(tile.offset, expected, format!("{computed:016x}")))
 }
 
-/// Checks that the footer belongs to the file's header, and that its numbers of frames and tiles agree with `layout`
-/// and with the length of its payload. `offset` is the offset of the footer record in the file, `payload_bytes` the
-/// number of bytes between this record and the trailer.
+/// Checks that the footer belongs to the file's header, of which `header` holds the bytes. Also checks that the
+/// footer's numbers of frames and tiles agree with `layout` and with the length of its payload. `offset` is the offset
+/// of the footer record in the file, `payload_bytes` the number of bytes between this record and the trailer.
 fn check_footer(
     footer: &FooterRecord,
     layout: &Layout,

@@ -33,8 +33,8 @@ pub struct RecoverReport {
 
 /// Recovers a damaged container and returns a report. Writes a valid container `dst` with the frame blocks of the
 /// damaged container `src`, up to the first frame block that lacks its time stamps or a tile. Every value keeps its
-/// bits. After a damaged record, every multiple of 64 bytes is tried as the start of the next. Memory: about 150 bytes
-/// per tile, the time stamps, and one tile buffer.
+/// bits. After a damaged record, every multiple of 64 bytes is tried as the start of the next record. Memory: about 150
+/// bytes per tile, the time stamps, and one [`TileBuffer`].
 ///
 /// Fails if the header of `src` is damaged or `dst` cannot be written. If no frame can be saved, `dst` has no frames
 /// and the report says so; that is not an error.
@@ -167,9 +167,10 @@ impl FoundRecords {
         tiles as u64 + times + 3 * layout.largest_tile(u64::MAX)
     }
 
-    /// Adds the tile whose record is at byte `position` of the file, if the tile is intact. Returns the number of
-    /// stored bytes after the record, which is 0 if the tile shares those of an earlier tile; `None` if the tile is
-    /// damaged.
+    /// Adds the tile of the record `tile`, which is at byte `position` of the file, if the tile is intact. Returns the
+    /// number of stored bytes that follow the record; it is 0 if the tile shares the stored bytes of an earlier tile.
+    /// Returns `None` if the tile is damaged. `start` is the offset of the first record, and `buffer` is used for
+    /// reading.
     fn add_tile(
         &mut self,
         file: &MappedFile,

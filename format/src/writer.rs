@@ -341,8 +341,9 @@ impl Drop for Writer {
     }
 }
 
-/// Checks that `times` are finite, strictly increasing and greater than `before`. The error holds the index of the
-/// first time that violates this, and a description of that time.
+/// Checks that `times` are finite, strictly increasing and greater than `before`, the time stamp of the frame before
+/// them (`None` if there is none). The error holds the index of the first time that violates this, and a description of
+/// that time.
 pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Result<(), (usize, String)> {
     let mut last = before;
     for (frame, &time) in times.iter().enumerate() {

@@ -9,8 +9,8 @@ use gseq::{Compression, Error, Reader, TileBuffer, TileFrames, TileId, TouchedPa
 use scene::{Scene, layout};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// Opens the container at `path`, verifies it and reads all its tiles. Checks that an error names a byte inside the
-/// file or its end.
+/// Opens the container at `path`, verifies it and compares all its tiles with `scene`. Returns an error if the reader
+/// finds the file malformed. Asserts that this error names a byte offset of at most `len`, the length of the file.
 fn check(scene: &Scene, path: &Path, len: u64) -> Result<(), Error> {
     let checked = Reader::open(path).and_then(|reader| {
         let verified = reader.verify();
@@ -27,8 +27,8 @@ fn small_scene() -> Scene {
     Scene::new(layout(3, 2, 2, &[2, 1, 1]), 5, 11)
 }
 
-/// Returns a scene with bounded columns and the same scene as it is read back. Its tiles are large enough that bounded
-/// encoding pays in some of them.
+/// Writes a scene whose columns have error bounds to `path`. Returns the original scene, then the scene as read back
+/// from the file. Tiles are large enough that the lossy encoding makes some of them smaller.
 fn bounded_scene(path: &Path) -> (Scene, Scene) {
     Scene::new(layout(40, 24, 4, &[2, 1, 1, 1]), 9, 11).bounded(1e-2, path)
 }
@@ -134,8 +134,8 @@ fn file_of_a_killed_writer_is_recovered() {
     scene.compare(&Reader::open(&saved).unwrap(), 5).unwrap();
 }
 
-/// Simulates a malicious writer: changes bytes of an index entry and of its record, then makes every checksum valid
-/// again.
+/// Simulates a malicious writer: applies `change` to the index entry and to the record of tile `tile`, in a copy of the
+/// container `good`, then makes every checksum valid again. Returns the bytes of the changed container.
 fn forge(good: &[u8], tile: usize, change: impl Fn(&mut [u8])) -> Vec<u8> {
     let mut bad = good.to_vec();
     let u64_at = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());

@@ -38,8 +38,8 @@ proptest! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Checks that values are within the error bound, that every method of reading returns the same values, and that
-    /// the file declares the bounds.
+    /// Checks columns with an error bound: values are within the bound, every method of reading returns the same
+    /// values, and the file states the bounds.
     #[test]
     fn bounded_columns_are_within_their_bound(
         gaussians in 1u64..90, frames in 1usize..12, gaussian_block in 1u32..70, frame_block in 1u32..6,

@@ -124,8 +124,8 @@ impl PointCloudShape {
         self.columns.iter().try_fold(attributes, |sum, column| sum.checked_add(column.planes))
     }
 
-    /// Returns the planes in coding order, without the position. The parameters must have passed
-    /// [`PointCloudShape::is_sound`].
+    /// Returns the planes (scalar components) of all attributes but the position, then those of all columns, in coding
+    /// order. The parameters must have passed [`PointCloudShape::is_sound`].
     fn planes(&self) -> Vec<Plane> {
         let mut planes = attribute_planes(self.sh_degree);
         for (k, column) in self.columns.iter().enumerate() {
@@ -274,8 +274,8 @@ pub(super) fn encode(
     (shape, encoder.finish(), order)
 }
 
-/// Decodes the Gaussians and their further columns from their symbols `bytes`; `None` if the bytes do not match
-/// `shape`, which must have passed [`PointCloudShape::is_sound`].
+/// Decodes Gaussians from their symbols `bytes`. Returns their attributes, and the columns with their other values.
+/// Returns `None` if the bytes do not match `shape`, which must have passed [`PointCloudShape::is_sound`].
 pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians, Vec<Column>)> {
     let mut decoder = SymbolDecoder::new(bytes)?;
     let mut cloud = Gaussians::zeros(shape.gaussians, shape.sh_degree);
@@ -343,14 +343,14 @@ impl CurveDistances {
     }
 }
 
-/// State that is carried from one plane (scalar component of all Gaussians) to the next while coding.
+/// Coder of planes (scalar components of all Gaussians): the state that it carries from one plane to the next.
 #[derive(Clone)]
 struct PlaneCoder {
     /// Values of the two planes coded before, the last one first: one value per Gaussian, less the mean of its plane.
     known: [Vec<f32>; 2],
     /// Moving average of the absolute prediction errors of each Gaussian over the planes, in quantization steps.
     sizes: Vec<f32>,
-    /// [`Plane::group`] of the current plane. All planes of a group share the entropy models.
+    /// Group ([`Plane::group`]) of the plane that is being coded. All planes of a group share the entropy models.
     group: usize,
     models: Residuals,
 }

@@ -96,7 +96,9 @@ pub(super) struct Readers<'a> {
 }
 
 impl TensorEntry {
-    /// Returns the table entry of the tensor `name`; its mean and predictor weights are still zero.
+    /// Returns the table entry of `tensor`, which has the name `name` and the role `role`. `steps` holds its
+    /// quantization step and offsets; `None` means a step of 1 without offsets. The mean and the predictor weights in
+    /// the entry are still zero.
     pub(super) fn new(name: &str, tensor: &Tensor, role: TensorRole, steps: Option<&TensorSteps>) -> TensorEntry {
         let TensorSteps { step, channels } = steps.cloned().unwrap_or_default();
         let (name, shape) = (name.to_owned(), tensor.shape.clone());
@@ -126,8 +128,8 @@ impl TensorEntry {
         if channels > 1 { rows.saturating_mul(columns) } else { 0 }
     }
 
-    /// Returns whether shape, role and quantization steps fit together. An entry from an untrusted file must pass this
-    /// check.
+    /// Returns whether shape, role and quantization steps of this tensor fit together. An entry from an untrusted file
+    /// must pass this check.
     pub(super) fn is_sound(&self) -> bool {
         let plane = |axes: &[usize]| {
             self.shape.len() == 4
@@ -260,9 +262,10 @@ impl SharedModels {
     }
 }
 
-/// Encodes the tensors of `entries`, and sets the means and predictor weights in the entries. Returns the entropy-coded
-/// symbols of the quantized tensors, and the values of tensors with [`TensorRole::Exact`]. Adds the approximate number
-/// of bits of every quantized tensor to `bits`.
+/// Encodes the tensors of `entries`, whose values are in `tensors`. `readers` holds the positions and times at which
+/// the deformation field is evaluated. Returns the entropy-coded symbols of the quantized tensors, and the values of
+/// tensors with [`TensorRole::Exact`]. Sets the means and predictor weights in the entries. Adds the approximate number
+/// of bits of every quantized tensor to `bits`, by name.
 pub(super) fn encode(
     entries: &mut [TensorEntry],
     tensors: &Tensors,
@@ -292,8 +295,9 @@ pub(super) fn encode(
     (encoder.finish(), exact)
 }
 
-/// Decodes the tensors of `entries` from the symbols `bytes` and the unquantized values `exact`; returns `None` if
-/// symbols or values do not match the entries. The caller has checked the shapes.
+/// Decodes the tensors of `entries` from the symbols `bytes` and the unquantized values `exact`. `readers` holds the
+/// positions and times at which the deformation field is evaluated. Returns `None` if symbols or values do not match
+/// the entries, whose shapes the caller has checked.
 pub(super) fn decode(
     entries: &[TensorEntry],
     bytes: &[u8],
@@ -321,9 +325,10 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// Returns `tensor` as an archive would restore it: rounded to the quantization grids of `steps`. `position` holds the
-/// canonical positions of the Gaussians; `space` is the box of space that the feature planes cover. One difference from
-/// an archive: in a plane over time, every row is rounded by itself, even for times that no frame has.
+/// Returns `tensor`, whose role is `role`, as an archive would restore it: rounded to the quantization grids of
+/// `steps`. `position` holds the canonical positions of the Gaussians; `space` is the box of space that the feature
+/// planes cover. One difference from an archive: in a plane over time, every row is rounded by itself, even for times
+/// that no frame has.
 pub fn round_tensor(
     tensor: &Tensor,
     role: TensorRole,

@@ -98,7 +98,7 @@ impl Damage {
         Damage { place: place.to_owned(), expected: expected.into(), found: found.into(), advice: COPY_AGAIN }
     }
 
-    /// Returns the error about this defect in the file at `path`.
+    /// Returns an error for the user that describes this defect and names the file at `path`.
     pub(super) fn in_file(self, path: &Path) -> Error {
         Error::input(path, self.place, self.expected, self.found).hint(self.advice)
     }
@@ -191,7 +191,7 @@ impl ArchiveHeader {
 
     /// Returns the number of bytes of memory that decoding takes, estimated from the header alone. It is the sum of:
     /// - twice the length of the file
-    /// - twice the length of the `blobs`, because these bytes are copied into their parts
+    /// - twice the length of the plain bytes (section `blobs`): once decompressed, once copied into the decoded content
     /// - 16 times the length of the table of contents
     pub(super) fn bytes(&self) -> u64 {
         let [[_, table, _], .., [_, blobs, _]] = self.sections;

@@ -26,6 +26,8 @@ const MAX_OFFSET: f64 = 6.0;
 /// Returns, for each tensor of the deformation field, offsets of its quantization steps, by tensor name. An offset of 8
 /// doubles a step. A feature plane has one offset per channel; a matrix has one per row, then one per column. Returns
 /// an empty map if the field has no planes or an unknown structure.
+/// - `field`: role of each tensor, by name
+/// - `tensors`: values of the tensors, by name
 /// - `position`: canonical positions of the Gaussians
 /// - `space`: box of space that the planes cover
 /// - `times`: first and last time of the sequence
@@ -215,8 +217,9 @@ struct Samples {
     width: usize,
     /// Inputs of the trunk (the layers that all heads share), `[samples, width]`.
     features: Vec<f32>,
-    /// For every plane: its name, the index of its first channel among the inputs of the trunk, and for each channel
-    /// the sum over all samples of the squared product of the five other planes.
+    /// For every plane: its name, the index of its first channel among the inputs of the trunk, and one number per
+    /// channel. This number is the sum over all samples of p², where p is the product of the values that the five other
+    /// planes have in this channel.
     plane_factors: Vec<(String, usize, Vec<f64>)>,
 }
 
@@ -224,9 +227,9 @@ struct Samples {
 const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
-    /// Evaluates the feature planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each, and returns the
-    /// resulting inputs of the trunk (the layers that all heads share). Returns `None` if the planes are missing or
-    /// malformed.
+    /// Evaluates the feature planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each, from `first` to
+    /// `last`. Returns the resulting inputs of the trunk (the layers that all heads share); `None` if the planes are
+    /// missing or malformed. `position` holds the canonical positions; `space` is the box that the planes cover.
     fn new(tensors: &Tensors, position: &AttributeValues, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();

@@ -169,8 +169,8 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
 
-/// Checks the header of the archive at `path` before the rest is read. `head` holds the first [`HEADER_BYTES`] bytes of
-/// the file, `whole` is the length of the file in bytes.
+/// Checks the header of the archive at `path` before the other bytes of the file are read. `head` holds the first
+/// [`HEADER_BYTES`] bytes of the file, `whole` is the length of the file in bytes.
 ///
 /// # Errors
 /// Fails if `head` is not the header of an archive of this length, or if decoding the archive takes more memory than
@@ -270,7 +270,8 @@ pub fn round_column(column: &mut Column, step: i32) {
     cloud::round_all(column.values.planes_mut(), step);
 }
 
-/// Returns the values of the attribute [`ATTRIBUTES`]`[k]` of all Gaussians.
+/// Returns the values of the attribute [`ATTRIBUTES`]`[k]` of the Gaussians `cloud`: the first scalar component of all
+/// Gaussians, then the second, and so on.
 pub fn attribute_values(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
     cloud::values(cloud, k)
 }

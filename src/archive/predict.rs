@@ -8,7 +8,7 @@ const WEIGHT_DENOMINATOR: f32 = 64.0;
 /// from −128 (weight −2) to 127.
 pub(super) type PredictorWeights<const N: usize> = [i8; N];
 
-/// Returns the predictor weights as f32 factors: a weight of 64 becomes 1.0.
+/// Returns `weights`, which are stored in 64ths, as f32 factors: a weight of 64 becomes 1.0.
 pub(super) fn factors<const N: usize>(weights: &PredictorWeights<N>) -> [f32; N] {
     weights.map(|weight| f32::from(weight) / WEIGHT_DENOMINATOR)
 }
@@ -34,7 +34,7 @@ pub(super) struct PredictorFit<const N: usize> {
 }
 
 impl<const N: usize> PredictorFit<N> {
-    /// Returns a fit without samples.
+    /// Returns a least-squares fit to which no samples have been added yet.
     pub(super) fn new() -> Self {
         PredictorFit { products: [[0.0; N]; N], with_value: [0.0; N] }
     }

@@ -24,7 +24,8 @@ fn tensor(noise: &mut NoiseGenerator, shape: &[usize]) -> Tensor {
     Tensor { shape: shape.to_vec(), data }
 }
 
-/// Returns an archive content of `count` Gaussians with tensors of every role (plane, weights, exact, unread).
+/// Returns the content of an archive with `count` Gaussians, three columns, and tensors of every role (plane, weights,
+/// exact, unread). Their values are pseudo-random numbers generated from `seed`.
 fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
     let mut noise = NoiseGenerator(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
@@ -169,8 +170,8 @@ proptest! {
     }
 }
 
-/// Recomputes the checksums of an archive after its bytes were changed. Sections whose stored length exceeds the file
-/// end with the file.
+/// Recomputes the checksums of the archive `bytes` after a test changed some of its bytes. If the header gives a
+/// section more bytes than follow, the checksum covers the bytes up to the end of the archive.
 fn reseal(bytes: &mut [u8]) {
     let long = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
     let head: usize = 12 + 4 * 24 + 8;

@@ -91,8 +91,8 @@ impl CacheDir {
         Ok(found.map_err(wrong).ok())
     }
 
-    /// Opens the content of the cache entry `name` for reading; `None` if it is missing or damaged. Calls `damaged`
-    /// with a message about a damaged entry.
+    /// Returns the content of the cache entry `name` as a [`Spill`] (data on disk that can be read in any order).
+    /// Returns `None` if the entry is missing or damaged. Calls `damaged` with a message about a damaged entry.
     pub(super) fn open(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<Spill>> {
         let at = self.folder.join(name.file());
         let spill = |entry: CacheEntry| {

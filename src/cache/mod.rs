@@ -85,15 +85,15 @@ impl Cache {
         self.dir.is_some()
     }
 
-    /// Makes all cache keys that are created from now on depend on the ids of the Gaussians that are excluded from the
-    /// input, if there are any.
+    /// Makes all cache keys that [`Cache::key`] returns from now on depend on `ids`, the Gaussians that are excluded
+    /// from the input. An empty list has no effect on the keys.
     pub fn set_excluded_ids(&self, ids: &[u32]) {
         *self.excluded_ids_key.lock().unwrap_or_else(PoisonError::into_inner) =
             (self.is_enabled() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
 
-    /// Returns the cache key of `value`, a digest of its bits. Without a work folder returns [`CacheKey::NONE`] and
-    /// does not hash.
+    /// Returns the cache key of `value`: a digest of its bits and of the ids set by [`Cache::set_excluded_ids`].
+    /// Without a work folder returns [`CacheKey::NONE`] and does not hash.
     pub fn key(&self, value: &impl Serialize) -> CacheKey {
         let excluded_ids_key = *self.excluded_ids_key.lock().unwrap_or_else(PoisonError::into_inner);
         match (self.is_enabled(), excluded_ids_key) {
@@ -130,8 +130,9 @@ impl Cache {
 
     /// Returns the result of `stage` for `key` if it is stored. If it is not, computes it with `compute` and stores it.
     ///
-    /// `stage` cannot be divided into shards (parts), so a run that is limited to one shard computes it as any other
-    /// run does. If such a run must end before this stage, `compute` calls [`Cache::end_shard_run_before`] first.
+    /// `stage` cannot be divided into shards (parts). A run that is limited to one shard nevertheless computes the
+    /// whole stage. If it must end before the stage instead, `compute` begins with a call of
+    /// [`Cache::end_shard_run_before`].
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -234,9 +235,9 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`. Only a run that is limited to shard (part of the stage) 1 of 1
-    /// fails with [`Error::ShardDone`] instead: this shard is the whole stage, and a limited run ends when its shard is
-    /// done.
+    /// Returns `whole`, the full result of `stage`, except in a run that is limited to shard 1 of 1 (a single part,
+    /// which is the whole stage). Such a run ends when its shard is done, so the function then fails with
+    /// [`Error::ShardDone`].
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -250,8 +251,8 @@ impl Cache {
     /// called if the full result of `stage` is not stored. The caller then computes the shards that are not stored, and
     /// joins all n.
     ///
-    /// A run that is limited to one of several shards is an exception: this function itself does its work, and returns
-    /// an error instead of n (rule 5).
+    /// If the run is limited to one of several shards, this function computes and stores that shard, and returns an
+    /// error instead of n (rule 5).
     ///
     /// The work folder may hold shards of several divisions, which differ in the number of shards. The first of these
     /// rules that applies decides:

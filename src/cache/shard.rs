@@ -43,7 +43,7 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Shard (part of a divided stage) 1 of 1, which contains all the work of the stage.
+    /// Shard 1 of 1, which contains all the work of a stage. A shard is a part of a stage's work.
     pub(super) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
     /// Returns all `count` shards (parts) of a divided stage, in order.

@@ -1,4 +1,4 @@
-//! Messages on standard error. Only this module writes to standard error; lints reject other places.
+//! Messages on standard error. Only this module writes to standard error; Clippy lints reject such writes elsewhere.
 
 use std::io::{self, IsTerminal, Write};
 

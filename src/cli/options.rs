@@ -35,7 +35,8 @@ use splatsieve::scene::view_selection::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
 /// Returns the library's request for the command `compress`. Options that the command line does not give are taken from
-/// the recipe file, if this file records the options of an earlier run.
+/// the recipe file, if this file records the options of an earlier run. Unless `quiet` is set, the request asks the run
+/// to report its estimated time before it starts.
 ///
 /// # Errors
 /// Fails if the recipe or the goal (a quality or a size on disk) is invalid, or if the recipe file records cameras,
@@ -385,7 +386,7 @@ pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
 }
 
 /// Returns the library's memory settings: the memory limit, and whether the memory plan is printed. If a limit is
-/// given, also makes the allocator return freed memory to the system at once, where it can.
+/// given, also makes the allocator return freed memory to the system at once, on systems that support this.
 fn memory_budget(memory: Memory) -> Budget {
     if memory.memory.is_some() {
         return_freed_memory();
@@ -429,7 +430,7 @@ pub(super) fn input_options(
 }
 
 impl CameraFile {
-    /// Sets cameras, resolution, times and number of frames of `options` to those of the arguments.
+    /// Copies cameras, resolution, times and number of frames from these arguments of the command line into `options`.
     fn apply_to(self, options: &mut InputOptions) {
         options.cameras = self.cameras;
         options.size = self.resolution;

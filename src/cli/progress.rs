@@ -172,12 +172,11 @@ impl RunPosition {
     }
 
     /// Returns the estimated time from `now` until the end of the run, seconds. `step`: estimated time until the end of
-    /// the current task, seconds.
+    /// the running stage, computed from its own progress, seconds.
     /// - Before the first stage, returns `step`.
-    /// - Later, returns the time left of the current stage, but at least `step`, plus the expected times of the stages
-    ///   after it. If the earlier stages took longer or shorter than expected, all expected times are scaled by the
-    ///   same ratio, limited to 0.1 to 10. They are not scaled if less than half a second was expected for the earlier
-    ///   stages.
+    /// - Later, returns the time left of the running stage, but at least `step`, plus the expected times of all later
+    ///   stages. The expected times are multiplied by the ratio of actual to expected time of the finished stages,
+    ///   limited to 0.1 to 10. If less than half a second was expected for the finished stages, the ratio is not used.
     fn left(&self, step: f64, now: Instant) -> f64 {
         let Some((place, since)) = self.current else { return step };
         let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
@@ -278,7 +277,7 @@ struct Log {
 }
 
 impl Log {
-    /// Begins the log of `task`, whose time runs from now. The log lines start with `name`.
+    /// Creates the log of `task`, which starts at the time of this call. Every log line begins with `name`.
     fn new(name: String, task: Task<'_>, shared: Arc<Shared>) -> Log {
         let (done, next) = (AtomicU64::new(0), AtomicU64::new(LOG_INTERVAL_SECONDS));
         let is_nested = shared.logs.fetch_add(1, Ordering::Relaxed) > 0;

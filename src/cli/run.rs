@@ -62,7 +62,8 @@ pub(super) fn run(cli: Cli) -> Result<()> {
     }
 }
 
-/// Runs `compress`. With `--list-stages` or `--dry-run`, prints the stages or the plan instead and compresses nothing.
+/// Runs the command `compress` and prints its summary. With `--list-stages`, only prints the stages that can be divided
+/// into shards. With `--dry-run`, only prints the plan of the run. `quiet`: whether progress is hidden.
 fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
     let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Brief };
@@ -356,7 +357,8 @@ fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
     }
 }
 
-/// Prints a result: as JSON, which contains the notes, or as text, with the notes on standard error before it.
+/// Prints the result of a command. If `as_json` is set, prints `value`, which contains the notes, as JSON. Otherwise
+/// writes `notes` to standard error, then prints the text that `text` returns.
 fn print_result(
     as_json: bool,
     value: &impl serde::Serialize,

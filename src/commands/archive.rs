@@ -39,10 +39,10 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Restores the model in the archive at `path` in the form that it had before: a model folder or a single file, at the
-/// path `output`. Returns `None` and writes nothing if `kind`, the requested kind of output, is not this form:
-/// - An archive that states the file layout of its model format has the kind of this layout.
-/// - Any other archive holds a model folder or a PLY; `kind` must be one of these two.
+/// Restores the model in the archive at `path` in its original form, a model folder or a single file, and writes it to
+/// `output`. Returns `None` and writes nothing if `kind`, the requested format, is not the original format:
+/// - If the archive states the file layout of its model format, this layout determines the original format.
+/// - Otherwise the archive holds a model folder or a PLY file. It is restored if `kind` is either of the two.
 ///
 /// After `None`, the caller opens the archive as an input and converts it.
 ///
@@ -98,11 +98,13 @@ pub fn unpack_archive(
 }
 
 /// Writes all Gaussians of `input` to the archive `output`. The quantization steps are chosen so that renders of the
-/// archive have about 50 dB PSNR against renders of the input. If the input consists of explicit frames, the archive is
-/// a container with bounded errors, whose bounds are chosen in the same way. Returns the report on the written file.
+/// archive have about 50 dB PSNR against renders of the input. If the input stores every frame explicitly, the archive
+/// is a container with an error bound for each attribute; the bounds are chosen for the same PSNR. Returns the report
+/// on the written file.
 ///
 /// # Errors
-/// Fails if the input cannot be read or has no archives, or if the output exists already or cannot be written.
+/// Fails if the input cannot be read or cannot be stored in an archive (such as a frame stream), or if the output
+/// exists already or cannot be written.
 pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<ConvertReport> {
     if input.is_stream() {
         return Err(Error::usage(

@@ -135,8 +135,8 @@ fn pack_whole(
     Ok(packed(output, info.count, info.times.len(), bytes, larger, notes))
 }
 
-/// Packs a frame stream into the container `output` while its frames arrive. In the stream, each Gaussian must keep its
-/// id from frame to frame.
+/// Packs a frame stream into the container `output` while its frames arrive, and returns the report on the container.
+/// In the stream, each Gaussian must keep its id from frame to frame. `storing`: precision of the stored values.
 fn pack_arriving(
     stream: FrameStream<Stdin>,
     input: &InputOptions,
@@ -160,7 +160,7 @@ fn pack_arriving(
 }
 
 /// Returns the report on the container at the path `output`, which was just written. `bytes`: size of the container.
-/// `larger`: if the container is larger than the input, the reason for this.
+/// `larger`: reason why the container is larger than the input; `None` if it is not.
 fn packed(
     output: &Path,
     gaussians: usize,
@@ -210,8 +210,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput
     Ok(opened)
 }
 
-/// Checks that the file at `path` is a container, possibly damaged: its extension is `.gseq`, or it begins like a
-/// container.
+/// Checks that the file at `path` is a container, possibly damaged. Fails unless its extension is `.gseq` or its first
+/// bytes are those of a container.
 fn check_is_container(path: &Path) -> Result<()> {
     let mut head = Vec::new();
     open_file(path)?.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;

@@ -38,8 +38,8 @@ pub fn is_container(output: &Path, requested: Option<OutputKind>) -> bool {
 }
 
 /// Writes all Gaussians of `input` to `output` in the format `requested`. If `requested` is `None`, the format follows
-/// from the name of the output. For a folder, it is the input's own model format, or one PLY file per frame if the
-/// input has no model format (a container or a frame stream).
+/// from the name of the output. If the output is then a folder, its format is the input's own model format, or one PLY
+/// file per frame if the input has no model format (a container or a frame stream).
 ///
 /// # Errors
 /// Fails if the input cannot be read or cannot be written in this format, or if the output exists already.

@@ -123,9 +123,9 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
 }
 
-/// Removes the times from the views of `opened` (shots: pairs of a camera and a time), so that every camera can show
-/// every frame. Returns a copy of the views with their times. Does nothing and returns `None` if there are no cameras,
-/// or if `has_other_frames` is false, that is, if the frames are at the times of the cameras.
+/// Removes the times from the shots (pairs of a camera and a time) of `opened`, so that every camera can show every
+/// frame. Returns a copy of the shots with their times. Does nothing and returns `None` if there are no cameras, or if
+/// `has_other_frames` is false: the frames are then at the times of the cameras.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();
@@ -149,10 +149,10 @@ fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     }
 }
 
-/// Plans a video. Returns its cameras and, for each image of the video in order, the frame of the model and the index
-/// of the camera. `times`: times of the frames.
+/// Plans a video of `shots` (pairs of a camera and a time). Returns the cameras of the video and, for each image in
+/// order, the frame of the model and the index of its camera. `times`: times of the frames.
 /// - For one view: one image per frame, from the camera of this view whose time is nearest.
-/// - For a path: new cameras that move through the cameras of its views.
+/// - For a path: one new camera per image, on a path through the cameras of the views that `path` lists.
 fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
     match path {
         VideoCamera::View(view) => {

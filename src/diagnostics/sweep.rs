@@ -4,7 +4,7 @@
 //!
 //! Every point of a curve is a complete run as a user would start it, from opening the input to a result on disk, so
 //! that the measured time and memory are those of this run alone. The result is deleted once it has been measured.
-//! Memory: that of `compress`, then that of `evaluate`.
+//! Memory: first the memory of `compress`, then the memory of `evaluate`.
 
 use std::fs;
 use std::path::PathBuf;

@@ -53,12 +53,13 @@ pub struct TestSceneOptions {
 pub struct TestSceneReport {
     /// Summary of the compression.
     pub summary: Summary,
-    /// One entry per body (object of the test scene). All Gaussians of a body that are in neither of the last two
-    /// numbers were pruned. The elements are:
+    /// Numbers of Gaussians of each body (object of the test scene). The elements of an entry are, in order:
     /// - the body
     /// - the number of its Gaussians
-    /// - how many of them were kept: unmerged, or as the first member of a merged group
-    /// - how many of them were merged into other Gaussians
+    /// - the number of its kept Gaussians: unmerged, or the first member of a merged group
+    /// - the number of its Gaussians that were merged into others
+    ///
+    /// All other Gaussians of the body were pruned.
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 
@@ -117,7 +118,7 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
         .iter()
         .map(|&body| {
             let members = made.body_ids(body);
-            // The first Gaussian with a place of the output counts as kept, others with the same place as merged.
+            // The first Gaussian with an index in the output counts as kept, others with the same index as merged.
             let kept = members
                 .clone()
                 .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));

@@ -274,9 +274,9 @@ impl ModelPair {
         Ok((self.evaluation(scores)?, observed))
     }
 
-    /// Renders every view and returns the values of `observe` for all views, in order. `observe` gets the same
-    /// arguments as in [`ModelPair::observe`], but no scores are computed. The work is done as the stage `name`, which
-    /// can be divided into shards (ranges of the views).
+    /// Renders every view and returns the values of `observe` for all views, in order. Arguments of `observe`: the
+    /// frame state of the original, the camera, and the images of the view. Computes no scores. The work is done as the
+    /// stage `name`, which can be divided into shards (ranges of the views).
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.

@@ -79,7 +79,7 @@ impl RenderedAttributes {
 /// Checks that all positions in `state` are finite. `kind` names the file `path` in the message, for example "a .spz".
 ///
 /// # Errors
-/// Returns [`Error::Usage`] with the first Gaussian whose position is not finite.
+/// Returns [`Error::Usage`], which names a Gaussian whose position is not finite.
 pub fn check_positions(state: &Gaussians, path: &Path, kind: &str) -> Result<()> {
     let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) else { return Ok(()) };
     let id = at % state.len();

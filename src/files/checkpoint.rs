@@ -515,8 +515,9 @@ fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
     file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
 }
 
-/// Reads the bytes of file `index` of the archive, which must be uncompressed. Fails if they do not match the file's
-/// checksum. A checksum of 0 is not compared: PyTorch writes it if it did not compute one.
+/// Reads the bytes of the file with index `index` in the zip archive `archive`, which `file` holds. The file in the
+/// archive must be uncompressed. Fails if its bytes do not match its checksum. A checksum of 0 is not compared: PyTorch
+/// writes it if it did not compute one.
 fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
     let (start, size, expected) = {
         let entry = archive.by_index(index)?;

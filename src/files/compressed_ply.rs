@@ -23,7 +23,7 @@ use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficients};
 
-/// Name of a property that only this format has; the format is recognized by it.
+/// Name of a PLY property that only `.compressed.ply` files have. A file with this property is read in this format.
 pub const MARKER_PROPERTY: &str = "packed_position";
 /// Number of Gaussians per row of the element `chunk`.
 const CHUNK: usize = 256;

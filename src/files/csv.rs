@@ -19,8 +19,8 @@ fn without_formula(field: String) -> String {
     if runs && field.parse::<f64>().is_err() { format!("'{field}") } else { field }
 }
 
-/// Returns a table with the column `names` and the fields of `rows` as CSV text. Fields with delimiters are quoted
-/// according to RFC 4180.
+/// Returns a table as CSV text: a header line with the column names `names`, then one line for each of `rows`. Fields
+/// with delimiters are quoted according to RFC 4180.
 ///
 /// # Panics
 /// Panics if a row does not have as many fields as there are names.

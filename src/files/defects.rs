@@ -5,8 +5,8 @@
 pub const LISTED_ROWS: usize = 5;
 /// How an infinite opacity logit is repaired, for notes to the user.
 pub const INFINITE_LOGIT_REPAIR: &str = "read as ±100, which is opaque or invisible";
-/// Fraction of dropped rows above which the totals are the first of the notes to the user. At or below it they are the
-/// last.
+/// Fraction of dropped rows that determines where the note with the total counts stands among the notes to the user:
+/// first above this fraction, otherwise last.
 const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
 /// Counts of the rows of a file that have defects, and of the rows that the reader dropped because of defects.
@@ -67,8 +67,8 @@ impl Defects {
         self.defective == 0
     }
 
-    /// Returns the notes for the user: one per kind of defect and one with the totals. The totals come first if more
-    /// than 1% of the rows were dropped, otherwise last.
+    /// Returns the notes for the user: one per kind of defect, and one with the total counts of rows that were dropped
+    /// or repaired. The note with the totals comes first if more than 1% of the rows were dropped, otherwise last.
     pub fn notes(&self) -> Vec<String> {
         if self.is_empty() {
             return Vec::new();

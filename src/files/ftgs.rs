@@ -62,7 +62,8 @@ impl ClipTimes {
     pub const UNIT_INTERVAL: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None, frame_rate: FRAME_RATE };
 
     /// Returns the mapping of the increasing `times`, one per frame, to the range from 0 to 1: the first time becomes
-    /// 0, the last becomes 1. With fewer than two times, the time 1 after the first one (or after 0) becomes 1.
+    /// 0, the last becomes 1. A single time t becomes 0, and t + 1 becomes 1. Without times, the mapping leaves times
+    /// unchanged.
     pub fn from_times(times: &[f64]) -> ClipTimes {
         let first = times.first().copied().unwrap_or(0.0);
         let last = times.last().copied().filter(|&last| last > first).unwrap_or(first + 1.0);
@@ -249,8 +250,8 @@ pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Resul
 }
 
 /// Writes a file like [`write_ftgs`], but without widening narrow time windows. Players widen every window to a minimum
-/// standard deviation, which the header states. Here it states the smallest deviation in `params` if that is below the
-/// usual minimum [`MIN_TIME_DEVIATION`].
+/// standard deviation, which the header states. In this file, the header states the smallest deviation in `params` if
+/// that is below the usual minimum [`MIN_TIME_DEVIATION`].
 ///
 /// # Errors
 /// Fails if the file cannot be written.

@@ -28,8 +28,8 @@ use checked::CheckedReader;
 pub(crate) struct ParseAbort(RefCell<Option<Error>>);
 
 impl ParseAbort {
-    /// Stores `error` and returns an error of the parser's type. A seed (deserializer of a value) returns the latter to
-    /// stop the JSON parser; [`read`] then fails with `error`.
+    /// Stores `error` and returns an error of the parser's type, with which a seed (deserializer of a value) stops the
+    /// JSON parser. [`read`] then fails with `error`.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
         E::custom("stopped")

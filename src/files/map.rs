@@ -30,7 +30,8 @@ pub(crate) struct FileMap {
     identity: Option<FileIdentity>,
     map: Mmap,
     /// Estimated number of bytes of the map that are in memory: the bytes reported as read since pages were last
-    /// released, and their surroundings. `last_end` is the end of the last range that was reported.
+    /// released, and up to 64 KiB around each reported range. `last_end` is the end of the last range that was
+    /// reported.
     resident: AtomicUsize,
     last_end: AtomicUsize,
 }

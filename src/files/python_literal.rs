@@ -297,8 +297,10 @@ impl<'a> Parser<'a> {
         Err(unterminated)
     }
 
-    /// Skips text that is not a Python literal: up to the next `,`, `:` or `=` outside brackets that open in it, or to
-    /// the bracket that closes the construct around it. Fails if brackets do not match.
+    /// Skips text that is not a Python literal. Fails if brackets do not match. Stops before one of these characters:
+    ///
+    /// - a comma, colon or equals sign that is not in brackets within the skipped text
+    /// - a closing bracket that was opened before the skipped text
     fn skip_balanced(&mut self) -> Parsed<()> {
         let mut open = Vec::new();
         while let Some(c) = self.rest().chars().next() {

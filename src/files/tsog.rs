@@ -40,7 +40,7 @@ pub enum Timeline {
     /// [`StoredParams::format_specific`] holds the index of this frame.
     Frames(usize),
     /// Each Gaussian moves linearly and is visible in a Gaussian window of time. [`StoredParams::format_specific`]
-    /// holds the parameters that [`crate::files::ftgs`] describes.
+    /// holds the center and the log deviation of the window and the velocity, as in [`crate::files::ftgs`].
     Windows,
 }
 

@@ -23,8 +23,7 @@ pub(crate) struct DeclaredDirectory {
 }
 
 /// Reads the declared size of the list of files of the zip archive `file`, from the records at the end of the archive.
-/// Finds these records in the same way as the crate `zip`, so that the checked numbers are those that this crate will
-/// use.
+/// Finds these records in the same way as the crate `zip`, so the checked numbers are those that `zip` will use.
 ///
 /// # Errors
 /// Fails if there are no such records, or if reading fails.

@@ -97,8 +97,8 @@ impl Journal {
     }
 
     /// Returns the result of the stage `name` from the cache of `scene`. If the cache has no result for `key`, runs the
-    /// stage with `compute` as [`Journal::run_stage`] does, and stores the result under `key`. Only for stages that one
-    /// process runs as a whole.
+    /// stage with `compute` as [`Journal::run_stage`] does, and stores the result under `key`. `gaussians_in` is the
+    /// number of Gaussians before the stage. Only for stages that one process runs as a whole.
     ///
     /// # Errors
     /// Fails in these cases:

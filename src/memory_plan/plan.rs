@@ -41,9 +41,9 @@ pub struct MemoryPlan {
 }
 
 impl MemoryPlan {
-    /// Finds the fastest limits under which all stages fit into `budget`, and returns the plan with them. `estimates`
-    /// returns the estimates of all stages for given limits. If the user asked for the plan ([`Verbosity::Plan`]),
-    /// sends it as text to `events`, even if the stages do not fit.
+    /// Finds the fastest limits under which all stages of a run on the input `work` fit into the memory budget
+    /// `budget`, and returns the plan with them. `estimates` returns the estimates of all stages for given limits. If
+    /// the user asked for the plan ([`Verbosity::Plan`]), sends it as text to `events`, even if the stages do not fit.
     ///
     /// # Errors
     /// Fails if the stages do not fit under any limits; the error states the smallest sufficient budget.
@@ -61,9 +61,9 @@ impl MemoryPlan {
         if fits { Ok(plan) } else { Err(plan.too_small_error(budget)) }
     }
 
-    /// Returns whether there are limits under which all stages fit into the memory budget `budget`. A limit is a
-    /// maximum amount (frames, views, Gaussians; see [`Limits`]) that stages keep in memory at a time. `estimates`
-    /// returns the estimates of all stages for given limits.
+    /// Returns whether there are limits under which all stages of a run on the input `work` fit into the memory budget
+    /// `budget`. A limit is a maximum amount (frames, views, Gaussians; see [`Limits`]) that stages keep in memory at a
+    /// time. `estimates` returns the estimates of all stages for given limits.
     pub fn fits_budget(
         work: Workload,
         budget: Budget,
@@ -72,8 +72,9 @@ impl MemoryPlan {
         Self::closest(work, budget.limit(), estimates).excess_bytes() == 0
     }
 
-    /// Returns the plan with the fastest limits under which all stages fit into `budget` (bytes). If no limits suffice,
-    /// returns the plan that takes the least memory. `estimates` returns the estimates of all stages for given limits.
+    /// Returns the plan with the fastest limits under which all stages of a run on the input `work` fit into `budget`
+    /// (bytes). If no limits suffice, returns the plan that takes the least memory. `estimates` returns the estimates
+    /// of all stages for given limits.
     pub(crate) fn closest(
         work: Workload,
         budget: u64,

@@ -47,7 +47,8 @@ pub struct Workload {
     pub varying: Attributes,
     /// Memory that the input and its readers take, and numbers of frames and Gaussians per tile of the input.
     pub input: MemoryProfile,
-    /// Number of viewpoints: different view numbers among the views of all cameras.
+    /// Number of different view numbers among the views of all cameras. One view number stands for one viewpoint, seen
+    /// at one or several times.
     pub viewpoints: u64,
     /// Number of pixels per image of the camera with the largest images.
     pub pixels: u64,
@@ -156,8 +157,8 @@ impl Workload {
         frames * self.state_bytes(columns & self.varying)
     }
 
-    /// Returns the memory of all readers while each thread fills one block of Gaussians with values, with the buffers
-    /// in which the readers decode tiles (stored blocks of values).
+    /// Returns the memory in which each thread reads the values of one block of Gaussians. The buffers in which readers
+    /// decode tiles (stored blocks of values) are included.
     pub fn block_buffer_memory(&self) -> MemoryPart {
         let block =
             self.largest_block(GAUSSIANS_PER_BLOCK as u64) * (self.state_bytes(Attributes::all()) + self.input.reader);
@@ -199,7 +200,7 @@ impl Workload {
         (per_gaussian, vec![self.block_buffer_memory(), ("views", buffers)])
     }
 
-    /// Returns the memory that a list of `pictures` views takes.
+    /// Returns the memory that a list of `pictures` views takes: its name in the memory plan, and its bytes.
     pub fn view_list_memory(pictures: f64) -> MemoryPart {
         ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
     }

@@ -150,9 +150,10 @@ mod tests {
 
     use super::*;
 
-    /// Slow reference implementation of the sequential greedy rule of this module. Visits the nodes in order of rank. A
-    /// node without a leader becomes a leader, and every node without a leader that forms a pair with it joins it, as
-    /// long as the number of joins is below `limit`. Returns the leader of every node and the number of joins.
+    /// Slow reference implementation of the sequential greedy rule of this module. Visits the nodes in order of `rank`.
+    /// A node without a leader becomes a leader. Every node without a leader that forms a pair (leader, node) in
+    /// `pairs` with it joins it, as long as the number of joins is below `limit`. Returns the leader of every node and
+    /// the number of joins.
     fn sequential_oracle(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> (Vec<u32>, usize) {
         let n = rank.len();
         let mut order: Vec<u32> = (0..n as u32).collect();

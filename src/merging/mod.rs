@@ -218,9 +218,9 @@ pub fn run<E>(
     Ok(MergeResult { groups, proxies, passes })
 }
 
-/// Returns the rank of each of `groups`, from 0. Groups are ranked by the sum of the contributions C of their
-/// Gaussians, largest first; ties are broken by the hash of the id of the leader, the Gaussian into which the others
-/// are merged.
+/// Returns the rank of each of `groups`, from 0. Groups are ranked by the sum of the contributions C of their Gaussians
+/// (from `importance`), largest first. Ties are broken by the hash of the id of the leader, the Gaussian into which the
+/// others are merged.
 fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
     let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
@@ -292,7 +292,7 @@ impl<'a> MergeNodes<'a> {
 
 /// Finds sets of coincident nodes (Gaussians or merged groups): nodes that are equal in every attribute that tests 1
 /// and 2 ([`appearance`]) compare, and that pass these tests with the thresholds `gates`. The leader of a set is the
-/// node that ranks first; all others are its members, however many there are.
+/// node with the lowest `rank`; all others are its members, however many there are.
 ///
 /// Calls `take` with the pairs (leader, member), ordered by leader. Each call gets at most `max_batch` pairs (at least
 /// 1), and whether the pairs are divided among several calls.
@@ -332,8 +332,8 @@ fn each_coincident<E>(
 
 /// Finds the pairs of nodes (Gaussians or merged groups) that pass tests 1 (place and size) and 2 (color) of `pass`. A
 /// pair (leader, member) proposes to merge the member into the leader. The member is among the leader's nearest
-/// neighbors and ranks after it. `unit`: number of scene units in one unit of the recipe's lengths. Returns the number
-/// of nodes with more neighbors within the radius ε than were examined.
+/// neighbors and has a higher `rank`. `unit`: number of scene units in one unit of the recipe's lengths. Returns the
+/// number of nodes with more neighbors within the radius ε than were examined.
 ///
 /// Calls `take` with the pairs, ordered by leader in voxel order, then by distance. Each call gets at most `max_batch`
 /// pairs (at least 1), and whether the pairs are divided among several calls.

@@ -183,7 +183,8 @@ mod tests {
         axes * DMat3::from_diagonal(scales * scales) * axes.transpose()
     }
 
-    /// Slow reference: computes mean and covariance by the textbook formula, forming Σ.
+    /// Slow reference for [`moments`]: returns mean and covariance of the mixture `parts` by the textbook formula,
+    /// which forms Σ. If `about` is given, it is returned as the mean, and the second moments are taken about it.
     fn oracle(parts: &[WeightedGaussian], about: Option<DVec3>) -> (DVec3, DMat3) {
         let mean = about.unwrap_or_else(|| parts.iter().fold(DVec3::ZERO, |sum, p| sum + p.position * p.weight));
         let sigma = parts

@@ -340,8 +340,8 @@ mod tests {
         assert_eq!((found.collect::<Vec<_>>(), truncated), (vec![2], false));
     }
 
-    /// Returns the seconds that the neighbor queries for all `points` take, and the number of points with more than `k`
-    /// neighbors.
+    /// Searches the `k` nearest neighbors within the distance `epsilon` of each of the `points`. Returns the time in
+    /// seconds, and the number of points with more than `k` neighbors.
     fn time_queries(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
         let start = Instant::now();
         let index = PointIndex::new(numbered(points), epsilon);

@@ -60,14 +60,14 @@ impl MergeScene {
         self.merge_moving(recipe, limit, std::slice::from_ref(&self.states.position))
     }
 
-    /// Merges all Gaussians of this scene. `frames`: positions at each frame, the first of which is the reference
-    /// frame. All Gaussians are alive at all frames.
+    /// Merges all Gaussians of this scene, with at most `limit` joins. `frames`: positions at each frame, the first of
+    /// which is the reference frame. All Gaussians are alive at all frames.
     fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[AttributeValues]) -> MergeResult {
         let rows: Vec<u32> = (0..self.states.len() as u32).collect();
         self.merge_rows(&rows, recipe, limit, frames)
     }
 
-    /// Merges only the Gaussians in `rows`, with frames as in [`MergeScene::merge_moving`].
+    /// Merges only the Gaussians in `rows`. All other arguments are those of [`MergeScene::merge_moving`].
     fn merge_rows(
         &self,
         rows: &[u32],

@@ -110,8 +110,8 @@ pub trait InputModel: Send + Sync {
         None
     }
 
-    /// Returns the number of training frames if the input gives it. The last of these frames is one frame interval
-    /// before the end of the time span.
+    /// Returns the number n of training frames if the input gives it. Frame i lies at the fraction i/n of the time
+    /// span, so the last frame is one frame interval before the end of the time span.
     fn data_frames(&self) -> Option<usize> {
         None
     }
@@ -227,8 +227,8 @@ pub trait InputModel: Send + Sync {
         Ok(reduced_trajectories(self.source(), reduction))
     }
 
-    /// Writes the compressed model `reduction` to `path`, a new file or an empty folder, and returns notes for the
-    /// user. Write buffers stay within the memory of `limits`. Progress is reported to `events`.
+    /// Writes the compressed model `reduction` as the kind of output `kind` to `path`, a new file or an empty folder.
+    /// Returns notes for the user. Write buffers stay within the memory of `limits`. Progress is reported to `events`.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.

@@ -228,7 +228,9 @@ impl InputModel for PlySequence {
     }
 }
 
-/// Writes the frames of the compressed model to PLY files with the properties, comments and names of the input files.
+/// Writes the frames of `reduction`, the compressed model of `sequence`, as PLY files with the properties, comments and
+/// names of the input files. `path` is the folder of these files if `kind` is [`OutputKind::PlySequence`]; otherwise it
+/// is the only file.
 fn write_files(
     sequence: &PlySequence,
     reduction: &CompressedModel,

@@ -91,9 +91,10 @@ pub(super) fn write_trajectories(
     write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.max_kept_frames, events)
 }
 
-/// Writes a container of a compressed model with proxies (Gaussians that replace merged ones). The members of a proxy
-/// can be anywhere in the source. So one block of frames is processed after another, and within a block of frames one
-/// range of output Gaussians after another. A range needs about `max_gaussians` source Gaussians in memory.
+/// Writes the compressed model `reduction` of `source`, which has proxies (Gaussians that replace merged ones), to
+/// `path` as a container. The members of a proxy (merged Gaussians) can be anywhere in the source. So one block of
+/// frames is written after another, and in it one range of output Gaussians after another. A range is computed from at
+/// most `max_gaussians` source Gaussians, which are kept in memory; a single block of Gaussians may need more.
 fn write_merged(
     source: &dyn FrameSource,
     reduction: &CompressedModel,

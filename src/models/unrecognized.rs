@@ -132,7 +132,8 @@ fn names(folder: &Path) -> Vec<String> {
 mod tests {
     use super::*;
 
-    /// Creates empty files in a new folder and returns the error message for this folder.
+    /// Creates empty files at the paths `files` in a new folder. Returns the error message for opening this folder as a
+    /// model.
     fn message(files: &[&str]) -> String {
         let folder = tempfile::tempdir().unwrap();
         for file in files {

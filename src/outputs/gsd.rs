@@ -228,7 +228,8 @@ mod tests {
     /// Pixels of the four textures of a frame, each pixel with the four numbers that the format describes.
     type Pixels = [Vec<[f64; 4]>; 4];
 
-    /// Reads a file as the format specifies, without code shared with the writer.
+    /// Reads the `.gsd` file `path` as the format specifies, without code shared with the writer. Returns its JSON text
+    /// and the pixels of each frame.
     fn read(path: &Path) -> (Value, Vec<Pixels>) {
         let bytes = std::fs::read(path).unwrap();
         assert_eq!(&bytes[..4], b"GSD1");

@@ -109,8 +109,8 @@ impl OutputKind {
         matches!(self, OutputKind::Model | OutputKind::PlySequence | OutputKind::SogSequence)
     }
 
-    /// Returns whether this kind of output stores the values of every frame. All other kinds store a model, from which
-    /// frames are computed.
+    /// Returns whether this kind of output is made from the values of every frame: the frames themselves, or motions
+    /// fitted to them. The kinds `Model`, `Ply` and `Archive` are made from the stored parameters of a model instead.
     pub fn stores_frames(self) -> bool {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
     }

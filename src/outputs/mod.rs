@@ -20,9 +20,9 @@ pub mod time_windows;
 mod tests {
     use crate::model::{Gaussians, opacity};
 
-    /// Returns two results: the opacity of Gaussian `id` of the frame state `state`, and the opacities of everything
-    /// that a player shows closer to this Gaussian than half its largest scale. `shown` has the position and opacity of
-    /// everything that the player shows at this frame. Returns `None` if the opacity of the Gaussian is below 0.1.
+    /// Returns the opacity of Gaussian `id` of the frame state `state`, and the opacities in `shown` that belong to
+    /// positions near it: closer than half its largest scale. `shown` has the position and opacity of everything that a
+    /// player shows at this frame. Returns `None` if the opacity of the Gaussian is below 0.1.
     pub(super) fn opacities_near(state: &Gaussians, id: usize, shown: &[([f64; 3], f64)]) -> Option<(f64, Vec<f64>)> {
         let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
         let at = state.position.row::<3>(id).map(f64::from);

@@ -236,7 +236,8 @@ mod tests {
     use crate::outputs::tests::{blended, opacities_near};
     use crate::passes::gather_all;
 
-    /// Evaluates the formulas of the player: returns position and opacity of every Gaussian at the time `time`.
+    /// Returns the position and the opacity of every Gaussian of `file` at the time `time`, by the formulas of the
+    /// player.
     fn shown(file: &Ftgs, time: f64) -> Vec<([f64; 3], f64)> {
         let params = &file.params;
         let own = |plane: usize, row: usize| f64::from(params.format_specific.plane(plane)[row]);

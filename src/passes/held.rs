@@ -15,8 +15,8 @@ pub struct FramesInMemory {
 }
 
 impl FramesInMemory {
-    /// Creates a source of `count` Gaussians without any frame. `varying` names the attributes that vary in time;
-    /// `constant` holds the values of all others.
+    /// Creates a source of `count` Gaussians with SH coefficients up to `sh_degree`, without any frame. `varying` names
+    /// the attributes that vary in time; `constant` holds the values of all others.
     pub fn new(count: usize, sh_degree: usize, varying: Attributes, constant: Gaussians) -> Self {
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
         FramesInMemory { info, constant, frames: Vec::new() }

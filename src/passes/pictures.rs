@@ -251,7 +251,8 @@ impl<W: Send> Workers<W> {
     }
 
     /// Passes each of the views `pictures` to one of the workers: `visit` gets the worker, the Gaussians of `subject`
-    /// at the frame of the view, and its camera. `new_worker` creates a worker if all others are busy.
+    /// at the frame of the view, and its camera, an element of `cameras`. `new_worker` creates a worker if all others
+    /// are busy.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.

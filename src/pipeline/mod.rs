@@ -121,8 +121,8 @@ pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<
 }
 
 /// Computes the statistics of the Gaussians of `scene`, scores the Gaussians and selects the survivors (Gaussians that
-/// are not removed) by the parameters of `recipe`. Returns statistics, scores and selection. `user` states which
-/// Gaussians the user wants to keep or to drop in any case.
+/// are not removed) by the parameters of `recipe`. Returns the statistics and the selection; [`Scored::scores`]
+/// computes the scores again. `user` states which Gaussians the user wants to keep or to drop in any case.
 ///
 /// # Errors
 /// Fails if frames cannot be read, or if their times do not allow statistics of motion.

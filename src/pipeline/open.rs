@@ -86,9 +86,11 @@ pub fn open_to_measure(
     Ok((scene, stages, None))
 }
 
-/// Sends the plan of the run and the forecast of its time and memory as messages, if the user asked for them. Also
-/// stores the forecast in `journal`. A run of only one shard (part of a divided stage) has no forecast. `measured`:
-/// kinds of statistics that were already computed while the input, a stream, arrived.
+/// Sends messages with the plan of the run and with the forecast of its time and memory, if the user asked for them. If
+/// a forecast is made, also stores it in `journal`, the record of the run. A run of only one shard (part of a divided
+/// stage) has no forecast.
+/// - `plan`: memory plan; `stages`: plan of the run.
+/// - `measured`: kinds of statistics that were already computed while the input, a stream, arrived.
 fn send_forecast(
     scene: &mut Scene,
     plan: &MemoryPlan,
@@ -322,7 +324,7 @@ impl<'a> Measuring<'a> {
 }
 
 /// Rule that assigns views to a frame of a stream before the times of later frames are known. A frame gets the views of
-/// the rig that have exactly its time, and all views without a time.
+/// the rig whose time equals its own up to rounding, and all views without a time.
 struct AssumedTimes<'a> {
     rig: &'a Rig,
     /// Time and index in the rig of each view that belongs to the requested split and has a time; sorted by time, then
@@ -347,8 +349,8 @@ impl<'a> AssumedTimes<'a> {
         AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
     }
 
-    /// Returns the views of a frame at the time `time`, in the order of the rig (set of cameras). A view is a pair: its
-    /// view number, then the index of its camera.
+    /// Returns the views of the frame at the time `time`, in the order of the rig (cameras and their views). Each view
+    /// is a pair: its view number, and the index of its camera.
     fn at(&self, time: f64) -> Vec<(u32, u32)> {
         let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);

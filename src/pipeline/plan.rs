@@ -79,8 +79,9 @@ impl RunPlan {
         Ok(if fits(&with_quality) { with_quality } else { plan })
     }
 
-    /// Returns the plan that [`RunPlan::within_memory`] describes, but without the stage that measures the quality of
-    /// the result. `fits` tells whether a given plan stays within the memory limit.
+    /// Returns the plan of a run that stays within the memory limit, with as much refinement as fits (see
+    /// [`RunPlan::within_memory`]). The plan does not measure the quality of the result. `fits` returns whether a plan
+    /// stays within the memory limit.
     fn refining_within_memory(
         request: &Request,
         input: InputMeta,

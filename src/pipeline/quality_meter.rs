@@ -35,9 +35,10 @@ pub(super) struct QualityMeter<'a> {
 }
 
 impl<'a> QualityMeter<'a> {
-    /// Creates a quality meter, which measures the PSNR of compressed models on the views `pictures`. These are in
-    /// order of frames. Second element of each pair: whether the view is held back from the search for the smallest
-    /// model, to report the quality. `comparison` holds the images with which renders of the models are compared.
+    /// Creates a quality meter, which measures the PSNR of compressed models on the views `pictures` of `cameras`.
+    /// - `pictures`: views in the order of frames. Second element of each pair: whether the view is held back from the
+    ///   search for the smallest model, to report the quality.
+    /// - `comparison`: images with which renders of the models are compared.
     ///
     /// # Errors
     /// Fails if no view is held back from the search, or if every view is.

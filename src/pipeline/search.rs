@@ -208,8 +208,8 @@ impl SearchStage {
     /// Returns the meter that measures the quality of models during the search:
     /// - If `photographs` is given (test views with their photographs), the meter compares renders with the
     ///   photographs. It holds one of every [`HELD_EVERY`] views back from the search.
-    /// - Otherwise it compares renders with `targets`, the stored renders of the original. The search uses the
-    ///   validation views of `parts`; the test views of `parts` are held back.
+    /// - Otherwise it compares renders with `targets`, the stored renders of the original, which `parts` divides by
+    ///   purpose. The search uses the validation views; the test views are held back.
     fn meter<'a>(
         &self,
         scene: &'a Scene,

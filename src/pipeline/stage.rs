@@ -109,8 +109,8 @@ pub trait Stage: Debug + Send + Sync {
     fn run(&self, run: &mut RunState<'_>) -> Result<()>;
 }
 
-/// Kinds of statistics of the Gaussians that were already computed while the input, a stream, arrived. For other inputs
-/// no kind was, which is the default.
+/// Kinds of statistics of the Gaussians that were already computed while the input, a stream, arrived. Default, for all
+/// other inputs: none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct MeasuredOnArrival {
     /// Whether the scan of all frames was done. It gives all statistics of the Gaussians except their visible
@@ -149,15 +149,16 @@ pub struct CountPlan {
 }
 
 impl CountPlan {
-    /// Returns the number of Gaussians with which refinement begins, if the input has `all` Gaussians and the output is
-    /// to have `wanted`.
+    /// Returns the number of Gaussians with which refinement begins. `wanted`: number of Gaussians in the output.
+    /// `all`: number of Gaussians in the input.
     pub fn count_before_refinement(&self, wanted: usize, all: usize) -> usize {
         start_count(self.refinement_starts_at, wanted, all)
     }
 
-    /// Returns the number of Gaussians that ranking leaves, if the input has `all` Gaussians and the output is to have
-    /// `wanted`. A search for the smallest model with a requested quality ranks only once, for all models that it
-    /// tries. If the run searches, `wanted` is ignored and the number for the smallest of these models is returned.
+    /// Returns the number of Gaussians that ranking leaves. `wanted`: number of Gaussians in the output. `all`: number
+    /// of Gaussians in the input. A search for the smallest model with a requested quality tries several models but
+    /// ranks only once. If the run searches, returns the number that the smallest tried model needs, whatever `wanted`
+    /// is.
     pub fn count_after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
@@ -325,7 +326,7 @@ pub struct RunState<'a> {
     pub recipe: String,
     /// Statistics of the Gaussians that were already computed while the input, a stream, arrived.
     pub arrived: Option<Measured>,
-    /// Statistics and scores of all Gaussians.
+    /// Statistics of all Gaussians, and the selection of the survivors (Gaussians that are not removed) by scores.
     pub scored: Option<Arc<Scored>>,
     /// Ranking of all Gaussians except those that are always dropped, most important first.
     pub ranking: Option<Arc<Ranking>>,
@@ -393,7 +394,8 @@ impl<'a> RunState<'a> {
         }
     }
 
-    /// Returns the statistics and scores of all Gaussians.
+    /// Returns the statistics of all Gaussians, and the selection of the survivors (Gaussians that are not removed) by
+    /// scores.
     ///
     /// # Errors
     /// Fails with an internal error if no earlier stage has computed them.

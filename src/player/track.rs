@@ -238,8 +238,8 @@ mod tests {
     use crate::diagnostics::demo_scene;
     use crate::passes::gather_all;
 
-    /// Decodes the chunks and returns the values `[frames][components][N]` of every frame. Works value by value as the
-    /// description at the top of this file says, and shares no code with the encoder.
+    /// Decodes `chunks` of the sequence `track`, and returns the values `[frames][components][N]` of every frame. Works
+    /// value by value as the description at the top of this file says, and shares no code with the encoder.
     fn unpacked(track: &PageSequence, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
         let (count, width) = (track.count, component_count(track.sh_degree));
         let chunk = |k: usize, moving: &[usize], frames: usize, base: &[Vec<i64>]| {

@@ -78,15 +78,15 @@ pub struct RunningContribution {
 }
 
 impl RunningContribution {
-    /// Creates sums of 0 for `count` Gaussians. Only every `pixel_stride`-th column and row of pixels of the views will
-    /// be rendered.
+    /// Creates the sums for `count` Gaussians, all 0. Only every `pixel_stride`-th column and row of pixels of the
+    /// views will be rendered.
     pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
         RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
     }
 
-    /// Renders the views `pictures` of `source`, in the order of frames, and adds the contributions of its Gaussians to
-    /// the sums. Every call must pass a source of the same Gaussians. Calls `advance` after each view. Fails if a frame
-    /// cannot be read.
+    /// Renders the views `pictures` (frames of `source` seen by `cameras`), in the order of frames, and adds the
+    /// contributions of the Gaussians to the sums. Every call must pass a source of the same Gaussians. Calls `advance`
+    /// after each view. Fails if a frame cannot be read.
     pub fn add(
         &mut self,
         source: &dyn FrameSource,

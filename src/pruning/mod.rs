@@ -65,8 +65,8 @@ pub struct SelectionCounts {
 
 /// Bytes of memory per Gaussian for the result of a selection and a copy of its ranking.
 pub const BYTES_PER_GAUSSIAN: usize = size_of::<bool>() + 2 * size_of::<u32>();
-/// Bytes of memory per Gaussian that are needed only while selecting: the result of stage 2, the user's decision, the
-/// positions in two orders, the order being sorted, and the sort keys.
+/// Bytes of memory per Gaussian that are needed only while selecting: whether it passes stage 2, the user's decision,
+/// its ranks in two orders, the list of ids being sorted, and the sort keys.
 pub const WORKING_BYTES_PER_GAUSSIAN: usize =
     size_of::<bool>() + size_of::<Option<bool>>() + 4 * size_of::<u32>() + 2 * size_of::<f64>();
 

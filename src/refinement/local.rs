@@ -50,7 +50,7 @@ impl LinearizedState {
         is_sparse.then(|| self.rows(&present, Some(present.clone())))
     }
 
-    /// Returns a copy with only the Gaussians in the rows `rows` of this state. `present` becomes
+    /// Returns a copy with only the Gaussians that have the indices `rows` in this state. `present` becomes
     /// [`LinearizedState::present`] of the copy: the index in the model of each Gaussian if invisible ones are left
     /// out, otherwise `None`.
     fn rows(&self, rows: &[u32], present: Option<Vec<u32>>) -> LinearizedState {

@@ -148,7 +148,7 @@ impl RefineStage {
 
     /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. `pixels`:
     /// number of pixels of a view. `first`: number of Gaussians with which refinement begins. If prune steps remove
-    /// Gaussians, the stride is that for a third of `first`, which may be larger than that for `first`; see
+    /// Gaussians, returns the stride for a third of `first` Gaussians, which may be larger; see
     /// [`RefineStage::stride`].
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
         let fewer = if self.cuts { first / 3 } else { first };

@@ -61,10 +61,10 @@ pub(super) struct OptimizerState<'a> {
     /// Indices of the frames of the target views, increasing.
     frames: Vec<usize>,
     varying: Attributes,
-    /// State of each frame in `frames`, without the changes (delta) that `constant_optimizer` has made.
+    /// State of each frame in `frames`, without the delta (change of the stored parameters) of `constant_optimizer`.
     linearized: LinearizedFrames,
-    /// Stored parameters without the changes (delta) that `constant_optimizer` has made. Used only if the model has
-    /// a deformation field.
+    /// Stored parameters, without the delta (change of these parameters) of `constant_optimizer`. Used only if the
+    /// model has a deformation field.
     stored: StoredParams,
     /// Constant delta (change of the stored parameters since the start of refinement) that `stored` and `linearized`
     /// already include. The total constant delta is this one plus the delta of `constant_optimizer`.
@@ -88,8 +88,8 @@ pub(super) struct OptimizerState<'a> {
     stride: NonZeroU32,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
-    /// Whether the frame states were evaluated again after `constant_optimizer` was created. It is created at the
-    /// beginning and in every prune step.
+    /// Whether the frame states were evaluated again after `constant_optimizer` (optimizer of the stored parameters)
+    /// was created, which happens at the beginning and in every prune step.
     reevaluated: bool,
 }
 
@@ -173,8 +173,9 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Replaces `constant_optimizer` by a new one, whose delta is 0, for the Gaussians in `linearized`. Also sets the
-    /// stride of the training views from the number of these Gaussians (see [`Loss::stride`]).
+    /// Replaces `constant_optimizer` (optimizer of the stored parameters) by a new one for the Gaussians in
+    /// `linearized`; its delta is 0. Also sets the stride of the training views from the number of these Gaussians (see
+    /// [`Loss::stride`]).
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -205,7 +206,8 @@ impl<'a> OptimizerState<'a> {
         TrajectoryDelta(self.keyframe_optimizers.iter().map(|knot| knot.delta().clone()).collect())
     }
 
-    /// Returns the two keyframes between which frame `frames[k]` lies, with their interpolation weights.
+    /// Returns the two keyframes around the frame with index `k` in `self.frames`: number and interpolation weight of
+    /// each.
     fn keyframes_around(&self, k: usize) -> [(usize, f32); 2] {
         TrajectoryDelta::keyframe_weights(
             self.keyframe_optimizers.len(),
@@ -262,7 +264,8 @@ impl<'a> OptimizerState<'a> {
         checkpoint
     }
 
-    /// Continues from the checkpoint of an earlier run that started with the same model and removed the same Gaussians.
+    /// Continues from a checkpoint (elements: see [`OptimizerCheckpoint`]). The run that wrote it must have started
+    /// with the same model and removed the same Gaussians.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -287,7 +290,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the positions of all Gaussians at the first frame of the target views, with the constant delta added.
+    /// Returns the positions of all Gaussians at the first frame of the target views, with the constant delta (change
+    /// of the stored parameters) added.
     pub(super) fn positions(&self) -> AttributeValues {
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return AttributeValues::default() };
         let mut moved = Gaussians { position: state.position.clone(), ..Gaussians::default() };
@@ -341,8 +345,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Computes the current state of frame `frames[k]`, including all changes that refinement has made so far, into
-    /// `now`.
+    /// Computes into `now` the current state of the frame with index `k` in `self.frames`, including all changes that
+    /// refinement has made so far.
     fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
         let change = self.constant_optimizer.delta();

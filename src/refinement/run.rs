@@ -83,8 +83,9 @@ impl RefineStage {
         journal.cached(&scene.work, NAME, key, run)
     }
 
-    /// Refines like [`RefineStage::run`], as part of the stage named `stage` and with the given target views. Returns
-    /// only the mean PSNR in dB of the validation views of the refined model, compared with the original.
+    /// Refines the model `reduction` to `wanted` Gaussians like [`RefineStage::run`], as part of the stage named
+    /// `stage`, with the target views `targets`. Returns only the mean PSNR, dB, of the result against the original on
+    /// the validation views.
     ///
     /// # Errors
     /// Fails like [`RefineStage::run`].
@@ -382,8 +383,9 @@ impl<'a> RefineRun<'a> {
     }
 
     /// Writes a checkpoint of the current phase (one prune step with its optimization steps, or the final steps), after
-    /// `steps` optimization steps of this phase. Does nothing if less time than `timer.interval` has passed since the
-    /// last checkpoint, or if the cache is disabled.
+    /// `steps` optimization steps of this phase. `schedule`: learning rates. `best_state`: best parameter deltas so
+    /// far, `None` before the final steps. Does nothing if less time than `timer.interval` has passed since the last
+    /// checkpoint, or if the cache is disabled.
     fn save_checkpoint(
         &self,
         optimizer: &OptimizerState<'_>,

@@ -200,9 +200,9 @@ pub(super) fn validation_every(views: usize) -> usize {
     VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
 }
 
-/// Chooses the target views and their cameras: views by which Gaussians are scored, views from cameras between these
-/// cameras, and, if [`Scene::outside`] is not 0, views from cameras outside the rig. Returns the cameras, and the views
-/// sorted by frame.
+/// Chooses at most `max_views` target views and their cameras: views by which Gaussians are scored, views from cameras
+/// between these cameras, and, if [`Scene::outside`] is not 0, views from cameras outside the rig. Returns the cameras,
+/// and the views sorted by frame.
 fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
     let mut pictures = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);

@@ -405,11 +405,12 @@ impl Drawing {
         let _ = write!(self.text, "{shape}<title>{}</title>{close}", escape(tip));
     }
 
-    /// Writes the label `words` beside the point (`x`, `y`). The label lies inside the plot and overlaps no other
-    /// label; it is left out if there is no such place.
+    /// Writes the label `words` beside the point (`x`, `y`), inside the plot and without overlap with another label.
+    /// Omits the label if no position allows this.
     fn label(&mut self, x: f64, y: f64, words: &str) {
         let wide = words.chars().count() as f64 * LETTER;
-        // Left end and foot. Places above come first, because curves of error against time fall.
+        // Left end and baseline of the label. Positions above the point come first, because curves of error against
+        // time fall.
         let places = [(x + 6.0, y - 4.0), (x - 6.0 - wide, y - 4.0), (x - 6.0 - wide, y + 14.0), (x + 6.0, y + 14.0)];
         let is_free = |&(left, foot): &(f64, f64)| {
             let inside = left > LEFT && left + wide < WIDTH && foot >= self.top + 2.0 && foot < HEIGHT - BOTTOM;

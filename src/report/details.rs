@@ -86,7 +86,7 @@ pub(super) fn details(
         .collect()
 }
 
-/// Returns an HTML paragraph with the remark `text`, which stands in the place of missing data.
+/// Returns an HTML paragraph with the remark `text`, which the page shows instead of missing data.
 fn absent(text: &str) -> String {
     format!("<p class=\"note\">{text}</p>\n")
 }

@@ -9,8 +9,8 @@ use crate::files::page_policy::{policy_digest, policy_meta_element};
 
 const STYLE: &str = include_str!("page.css");
 
-/// Returns a whole HTML file with the title `title` and the content `body`. `scripts` run at its end; they must not
-/// contain text from files.
+/// Returns a complete HTML file with the title `title` and the content `body`. The JavaScript texts `scripts` run at
+/// the end of the page; they must not contain text from files.
 pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
     let scripts: Vec<String> = scripts.iter().map(|script| format!("\n{script}")).collect();
     let digests: Vec<String> = scripts.iter().map(|script| policy_digest(script)).collect();

@@ -46,12 +46,12 @@ pub struct ViewErrorSums {
 
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct FailureSums {
-    /// Sum over pixels of w, the share of this kind of Gaussian in the pixel.
+    /// Sum over pixels of w, the share of one kind of Gaussian in the pixel.
     weight: f64,
-    /// Sum over pixels of w e²: the share of the kind times the squared difference of the renders.
+    /// Sum over pixels of w e²: the share w of one kind of Gaussian, times the squared difference e² of the renders.
     error: f64,
-    /// Sum over pixels of w ∇c·∇o. Here w is the share of the kind in the pixel, and c and o are the brightness of the
-    /// compressed and of the original render. The field `detail` is the sum of w ∇o·∇o.
+    /// Sum over pixels of w ∇c·∇o. Here w is the share of one kind of Gaussian in the pixel, and c and o are the
+    /// brightness of the compressed and of the original render. The field `detail` is the sum of w ∇o·∇o.
     kept_detail: f64,
     detail: f64,
 }
@@ -62,16 +62,17 @@ struct FailureSums {
 pub enum Verdict {
     /// Verdict if the scene has no Gaussian of the kind that the failure mode concerns.
     Absent,
-    /// Verdict if the scene has Gaussians of the kind, but their share of every render is below [`MIN_PIXEL_SHARE`].
+    /// Verdict if the scene has Gaussians of the kind that the failure mode concerns, but their share of every render
+    /// is below [`MIN_PIXEL_SHARE`].
     Unseen,
-    /// Verdict if compression dropped or merged almost no Gaussian of the kind: those that it did drop or merge make up
-    /// less than the fraction [`MIN_LOST_SHARE`] of the kind's contribution to renders.
+    /// Verdict if compression dropped or merged almost no Gaussian of the kind that the failure mode concerns: less
+    /// than the fraction [`MIN_LOST_SHARE`] of the contribution of this kind to renders.
     Untouched,
-    /// Verdict if damage to the kind is not visible. Where the kind is visible, PSNR is at least
-    /// [`VISIBLE_ERROR_PSNR_DB`], or it is lower than elsewhere by less than [`MIN_PSNR_GAP_DB`].
+    /// Verdict if damage to this failure mode's kind of Gaussian is not visible. Where this kind is visible, PSNR is at
+    /// least [`VISIBLE_ERROR_PSNR_DB`], or it is lower than elsewhere by less than [`MIN_PSNR_GAP_DB`].
     Passed,
-    /// Verdict if damage to the kind is visible. Where the kind is visible, PSNR is below [`VISIBLE_ERROR_PSNR_DB`],
-    /// and it is lower than elsewhere by at least [`MIN_PSNR_GAP_DB`].
+    /// Verdict if damage to this failure mode's kind of Gaussian is visible. Where this kind is visible, PSNR is below
+    /// [`VISIBLE_ERROR_PSNR_DB`], and it is lower than elsewhere by at least [`MIN_PSNR_GAP_DB`].
     Flagged,
 }
 

@@ -45,8 +45,7 @@ pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String
     out + "</div>\n"
 }
 
-/// Returns the table rows for the measurements of a failure mode that are known: the name of a measurement, and its
-/// value as text.
+/// Returns the table rows for a failure mode: the name and the value (as text) of each measurement that is known.
 fn rows(mode: &FailureMode) -> Vec<(&'static str, String)> {
     let of = |part: Option<usize>| part.map(|n| format!("{} ({})", count(n), percent(n as f64, mode.gaussians as f64)));
     let mut rows = vec![("Gaussians", Some(count(mode.gaussians)))];

@@ -24,9 +24,9 @@ pub const MIN_FAST_MOTION: f64 = 2e-3;
 /// neighbor, the change is relative to the distance, as root mean square over time. The lower median over the neighbors
 /// must reach this value.
 pub const MIN_NON_RIGID_CHANGE: f64 = 0.05;
-/// Minimum distance by which the change of a distance between two neighbors is divided to get the relative change, as a
-/// fraction of the scene extent. Without this minimum, invisible small motions of very close neighbors would give large
-/// relative changes.
+/// Minimum divisor, as a fraction of the scene extent, in the relative change of the distance between two neighbors.
+/// The change is divided by the distance or by this minimum, whichever is larger. Without the minimum, invisible small
+/// motions of very close neighbors would give large relative changes.
 const NEAREST: f64 = 1e-3;
 /// Number of nearest neighbors of a Gaussian to which distances are measured over time.
 pub const NEIGHBORS: usize = 8;
@@ -151,8 +151,8 @@ fn samples(frames: usize) -> Vec<usize> {
 /// - The neighbors are the nearest visible Gaussians at the reference frame.
 /// - For each neighbor, the root mean square change of its distance over the frames `frames` is divided by the distance
 ///   at the reference frame or by `nearest`, whichever is larger.
-/// - The result is the lower median of these relative changes over the neighbors. It ignores neighbors that belong to
-///   another object.
+/// - The result is the lower median of these relative changes over the neighbors. So neighbors that belong to another
+///   object have no effect if they are few.
 fn non_rigid_motion(
     source: &dyn FrameSource,
     reference: &Gaussians,
@@ -208,8 +208,9 @@ fn non_rigid_motion(
         .collect())
 }
 
-/// Returns the standard deviation of every Gaussian's base color over the sampled frames `frames` in which it is alive
-/// (opacity at least `alpha_min`), root mean square over the channels. Returns an empty list if colors do not vary.
+/// Returns the standard deviation of the base color of each of the Gaussians `all` (ids), root mean square over the
+/// channels. It is taken over those of the frames `frames` in which the Gaussian is alive (opacity at least
+/// `alpha_min`). Returns an empty list if colors do not vary.
 fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Attributes::SH) {
         return Ok(Vec::new());

@@ -249,7 +249,7 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
 }
 
 /// Returns the views by which the run that wrote the compressed model scored Gaussians. The summary of the run states
-/// only their number, so they are recognized by it:
+/// only the number of these views, so this function finds them by the number:
 /// - Returns the first of these sets that has the stated number of views: training views, all views, held-out views.
 /// - If no set has this number, or if there is no summary, returns the training views, or all views if there are no
 ///   training views.
@@ -344,7 +344,8 @@ fn show_again(
     Ok((shown, close))
 }
 
-/// Writes the report page `page` and its data files, which hold `report`, to the output folder of `options`.
+/// Writes the report to the output folder of `options`: the HTML page `page`, and data files (JSON and CSV) with the
+/// content of `report` and the stages of `run`.
 fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFiles) -> Result<()> {
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");

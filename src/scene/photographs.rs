@@ -41,11 +41,11 @@ impl Photographs {
     }
 
     /// Finds the photographs of the views `pictures` in `folder`. Returns the views that have a photograph, and the
-    /// paths of these photographs.
+    /// paths of these photographs. `rig`: cameras and their views. `times`: times of the frames.
     ///
-    /// First, photographs are found by the image paths in the camera file: a photograph is the file in `folder`
-    /// whose path is the longest suffix of the image path. Only if no view has such a photograph, photographs are
-    /// found by names with numbers:
+    /// First, photographs are found by the image paths in the camera file: a photograph is the file in `folder` whose
+    /// path is the longest suffix of the image path. Only if no view has such a photograph, photographs are found by
+    /// names with numbers:
     /// - `tNNN_vNN.png`, with the numbers of frame and view,
     /// - else `camNN/images/FFFF.png` as in DyNeRF, with the number of the frame. The folders `cam…`, sorted by their
     ///   numbers, belong to the views 0, 1, 2 and so on.

@@ -76,7 +76,7 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
 }
 
 /// Receives a stream of frames and links their Gaussians into tracks (Gaussians followed through frames). Only for
-/// streams for which [`is_linked`] returns true.
+/// streams for which [`is_linked`] returns true. Returns the input together with the cameras `rig`.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile

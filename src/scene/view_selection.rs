@@ -60,7 +60,8 @@ pub fn no_view_error(rig: &Rig) -> Error {
     ))
 }
 
-/// Returns the view with the number `view` at frame `frame`, among the views that `part` selects.
+/// Returns the view with the number `view` at frame `frame`, among the views of `rig` that `part` selects.
+/// `frame_times` holds the times of the frames.
 ///
 /// # Errors
 /// Fails as [`select_views`] does, and if the sequence has no such frame or the frame has no such view number.
@@ -182,7 +183,7 @@ mod tests {
     use super::*;
     use crate::model::{Camera, Shot};
 
-    /// Returns a rig with the given shots, each a tuple of view number, camera index, time and split.
+    /// Returns a rig with the views `shots`. Each is a tuple of view number, camera index, time and split.
     fn rig(shots: &[(u32, u32, Option<f64>, Split)]) -> Rig {
         let camera = |k: u32| Camera::look_at(DVec3::new(f64::from(k), -5.0, 1.0), DVec3::ZERO, 1.0, (8, 8));
         let shot = |&(view, camera, time, split)| Shot { view, camera, time, split, image: None };

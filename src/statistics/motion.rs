@@ -107,9 +107,8 @@ impl MotionSums {
     /// Adds the next frame by the definition `Runs` of motion: a step counts only if the Gaussian is alive in both of
     /// its frames.
     ///
-    /// `position` is `[3, len]`. `steps` holds the duration of the time step into this frame, then of the time step
-    /// before it, divided by the mean duration. `EVEN` states that both are 1. The divisions by them, which would take
-    /// longer than the rest of the loop, are then left out.
+    /// The arguments are those of [`MotionSums::add_frame`]. `EVEN` states that both durations in `steps` are 1. The
+    /// divisions by them, which would take longer than the rest of the loop, are then left out.
     #[inline(always)]
     fn add_frame_of_runs<const EVEN: bool>(
         &mut self,

@@ -86,9 +86,10 @@ impl ScanPlan {
         })
     }
 
-    /// Creates the plan with which the scan of a stream begins, before its frames have arrived. This plan assumes that
-    /// the frames are evenly spaced. If they are, the scan can be finished with the plan that [`ScanPlan::new`] creates
-    /// for the complete sequence (see [`ScanPlan::fits_scan_begun_with`]).
+    /// Creates the plan with which the scan of a stream begins, before its frames have arrived. `cameras` lists all
+    /// cameras that may see the frames. The plan assumes that the frames are evenly spaced. If they are, the scan can
+    /// be finished with the plan that [`ScanPlan::new`] creates for the complete sequence (see
+    /// [`ScanPlan::fits_scan_begun_with`]).
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {

@@ -37,8 +37,8 @@ const ROUNDER: f64 = 4_503_599_627_370_496.0;
 pub struct FootprintPlanes<'a> {
     /// Positions in scene coordinates: arrays of x, y and z.
     pub position: [&'a [f32]; 3],
-    /// Matrix R·S (rotation times scales). Column k is the k-th axis of the Gaussian times its scale. The entries of
-    /// `row` and column k are in array 3·row + k.
+    /// Matrix R·S (rotation times scales) of each Gaussian. Column k is the k-th axis of the Gaussian times its scale.
+    /// Array 3·r + k holds the entries in row r and column k.
     pub axes: [&'a [f64]; 9],
     /// Opacity in [0, 1].
     pub opacity: &'a [f64],

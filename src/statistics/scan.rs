@@ -88,8 +88,8 @@ impl<'a> BlockScan<'a> {
         }
     }
 
-    /// Adds frame `t`, in which the block has the attributes `gaussians`, and the cameras that see it. `changed` names
-    /// the attributes that may differ from the previous frame; in frame 0 all attributes but SH count as changed. SH is
+    /// Adds frame `t`, in which the block has the attributes `gaussians` and is seen by `cameras`. `changed` names the
+    /// attributes that may differ from the previous frame; in frame 0 all attributes but SH count as changed. SH is
     /// only checked for non-finite values, and only if `changed` contains it.
     ///
     /// # Panics

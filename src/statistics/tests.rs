@@ -19,7 +19,8 @@ fn random(seed: u64, k: u64) -> f64 {
     (hash_id(hash_id(seed) ^ k) >> 11) as f64 / 2f64.powi(53)
 }
 
-/// Returns a camera, at a distance of 4, that looks at the origin.
+/// Returns a camera that looks at the origin from a random direction, at a distance of 4 to 4.2. `seed` selects the
+/// direction.
 fn camera(seed: u64) -> Camera {
     let eye = DQuat::from_rotation_y(6.3 * random(seed, 0)) * DVec3::new(0.0, 2.0 * random(seed, 1) - 1.0, -4.0);
     let forward = -eye.normalize();
@@ -45,7 +46,8 @@ fn schedule(frames: usize, views: u32) -> ViewSchedule {
     schedule
 }
 
-/// Returns frames of `n` Gaussians that wander about. Each is not alive in about a third of the frames.
+/// Returns `frames` frames of `n` Gaussians, whose random attributes differ a little between frames. Each Gaussian is
+/// not alive in about a third of the frames. `seed` selects the random numbers.
 fn wanderers(n: usize, frames: usize, seed: u64) -> Vec<Gaussians> {
     (0..frames)
         .map(|t| {
@@ -90,8 +92,8 @@ fn scan(frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> Blo
     scan_at(&even_times(frames.len()), frames, schedule, scan)
 }
 
-/// Scans one Gaussian and returns its statistics. At frame t it has the x coordinate `x(t)` and the opacity
-/// `opacity(t)`. No camera sees it.
+/// Scans one Gaussian over `frames` frames and returns its statistics. At frame t it has the x coordinate `x(t)` and
+/// the opacity `opacity(t)`. No camera sees it. `motion`: definition of the statistics of motion.
 fn scan_one(
     frames: usize,
     x: impl Fn(usize) -> f32,

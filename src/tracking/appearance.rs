@@ -81,23 +81,23 @@ impl ComparedAppearance {
         self.color.iter().sum()
     }
 
-    /// Returns the difference in appearance A: the sum of the squared differences in size, shape, opacity and color,
-    /// each divided by the difference that adds 1 to A ([`SIZE_UNIT`], [`SHAPE_UNIT`], [`OPACITY_UNIT`],
-    /// [`COLOR_UNIT`]). A is symmetric.
+    /// Returns the difference in appearance A between this Gaussian and `other`: the sum of the squared differences in
+    /// size, shape, opacity and color, each divided by the difference that adds 1 to A ([`SIZE_UNIT`], [`SHAPE_UNIT`],
+    /// [`OPACITY_UNIT`], [`COLOR_UNIT`]). A is symmetric.
     pub(super) fn difference(&self, other: &ComparedAppearance) -> f32 {
         let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
         self.difference_without_opacity(other) + opacity * opacity
     }
 
-    /// Returns whether two Gaussians are near-duplicates: their distance is at most a quarter of the smaller size, and
-    /// they differ little in size, shape and color. Opacity does not count.
+    /// Returns whether this Gaussian and `other` are near-duplicates: their distance is at most a quarter of the
+    /// smaller size, and they differ little in size, shape and color. Opacity does not count.
     pub(super) fn is_near_duplicate(&self, other: &ComparedAppearance) -> bool {
         self.distance_cost(other, DUPLICATE_REACH, DUPLICATE_STRICTNESS) <= 1.0
     }
 
-    /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A between Gaussians a and b: positions x, sizes s,
-    /// difference A in size, shape and color. `reach` is r, `strictness` is q. If the distance term alone exceeds 1,
-    /// returns only this term.
+    /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A between Gaussians a (this one) and b (`other`):
+    /// positions x, sizes s, difference A in size, shape and color. `reach` is r, `strictness` is q. If the distance
+    /// term alone exceeds 1, returns only this term.
     pub(super) fn distance_cost(&self, other: &ComparedAppearance, reach: f32, strictness: f32) -> f32 {
         let unit = reach * self.size.min(other.size);
         let distance = squared_distance(&self.position, &other.position) / (unit * unit);
@@ -105,8 +105,9 @@ impl ComparedAppearance {
         if distance > 1.0 { distance } else { distance + strictness * self.difference_without_opacity(other) }
     }
 
-    /// Returns the difference in appearance without opacity: the sum of the squared differences in size, shape and
-    /// color, each divided by the difference that adds 1 to the sum ([`SIZE_UNIT`], [`SHAPE_UNIT`], [`COLOR_UNIT`]).
+    /// Returns the difference in appearance between this Gaussian and `other` without opacity: the sum of the squared
+    /// differences in size, shape and color, each divided by the difference that adds 1 to the sum ([`SIZE_UNIT`],
+    /// [`SHAPE_UNIT`], [`COLOR_UNIT`]).
     fn difference_without_opacity(&self, other: &ComparedAppearance) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size

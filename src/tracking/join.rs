@@ -154,10 +154,10 @@ impl Joiner {
 
 impl JoinedTracks {
     /// Updates the pairs of tracks (Gaussians followed through frames) after a frame. `tracks` are the open tracks
-    /// after this frame; a track that is not among them has ended. The result for a pair depends on its tracks:
+    /// after this frame; a track that is not among them has ended. There are four cases for a pair:
     ///
     /// - The earlier track has ended: the pair is marked.
-    /// - The later track has ended first: its tracks are joined if they satisfied the rule `CLOSE`. The pair is
+    /// - The later track has ended first: the two tracks are joined if they satisfied the rule `CLOSE`. The pair is
     ///   removed.
     /// - Both are present in this frame: the pair is removed if they do not satisfy the rule, or share too many frames.
     /// - One of them is missing in this frame: the count of shared frames is lowered.
@@ -223,8 +223,8 @@ impl JoinedTracks {
         }
     }
 
-    /// Ends the joining of tracks (Gaussians followed through frames) by one rule. Returns for each track the number of
-    /// its joined track, then the number of joined tracks.
+    /// Ends the joining of tracks (Gaussians followed through frames) by one rule. `linker` has linked the last frame.
+    /// Returns for each track the number of its joined track, then the number of joined tracks.
     fn finish(mut self, linker: &Linker) -> (Vec<u32>, usize) {
         let open_tracks = linker.open_tracks();
         self.pairs.retain_mut(|pair| {

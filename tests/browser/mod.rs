@@ -48,12 +48,12 @@ pub(crate) struct Browser {
 }
 
 impl Browser {
-    /// Starts `program` with an empty page of 1100 × 900 pixels.
+    /// Starts the browser `program` with an empty page of 1100 × 900 pixels, without graphics acceleration.
     pub(crate) fn start(program: &Path) -> Browser {
         Browser::with(program, &["--disable-gpu"])
     }
 
-    /// Starts `program` with WebGL, computed by the processor where there is no graphics card.
+    /// Starts the browser `program` with WebGL. The processor computes it if there is no graphics card.
     pub(crate) fn start_drawing(program: &Path) -> Browser {
         Browser::with(program, &["--use-angle=swiftshader", "--enable-unsafe-swiftshader"])
     }
@@ -161,7 +161,8 @@ impl Browser {
         send("touchEnd", &[]);
     }
 
-    /// Gives the browser a screen of `width` × `height` pixels. `scheme` selects light or dark colors.
+    /// Gives the browser a screen of `width` × `height` pixels. `scheme` is `light` or `dark`, the color scheme that
+    /// the page is told the user prefers.
     pub(crate) fn screen(&mut self, width: u32, height: u32, scheme: &str) {
         let is_phone = width < 600;
         let device = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": is_phone });
@@ -181,7 +182,8 @@ impl Browser {
         serde_json::from_value(found).unwrap()
     }
 
-    /// Presses and releases the key `name`, which enters no text.
+    /// Presses and releases the key `name`, such as `ArrowLeft`, which enters no text. `code` is the virtual key code
+    /// of this key on Windows.
     pub(crate) fn key(&mut self, name: &str, code: u32) {
         for kind in ["rawKeyDown", "keyUp"] {
             let event = json!({ "type": kind, "key": name, "code": name, "windowsVirtualKeyCode": code });

@@ -7,11 +7,14 @@
 //! <!-- cells of run_time where kept=10%: model | psnr_db:1 | bytes:, | equal_count/psnr_db[method=paper,kept=10%]:1 -->
 //! ```
 //!
-//! One row of the table stands for each combination of the columns without a format (here `model`) in the rows of
-//! `run_time.csv` that fulfil the conditions. A cell `FILE/COLUMN[CONDITIONS]:FORMAT` is the value of the first row of
-//! FILE that fulfils its conditions and agrees with that combination where FILE has these columns; a dash if there is
-//! none. Formats: `1` is one decimal, `,` an integer with commas, `%1` a percentage with one decimal, `=` the value as it
-//! is.
+//! In this example the table is made from the rows of `run_time.csv` that have `10%` in the column `kept`. A cell
+//! without a format (here `model`) is a key. The table has one row for each different combination of the values of all
+//! keys.
+//!
+//! A cell with a format is `COLUMN:FORMAT`, or `FILE/COLUMN[CONDITIONS]:FORMAT` for a value from another file. Its
+//! value is that of the first row of the file that fulfils the conditions and has the same key values, as far as the
+//! file has the key columns. It is a dash if there is no such row. Formats: `1` is one decimal, `,` an integer with
+//! commas, `%1` a percentage with one decimal, `=` the value as it is.
 //!
 //! `SPLATSIEVE_WRITE_DOCS=1` writes the tables instead of comparing them.
 
@@ -26,7 +29,7 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Returns the pages whose tables are compared.
+/// Returns the paths of the pages whose tables are compared with the CSV files.
 fn pages() -> [PathBuf; 2] {
     ["README.md", "docs/benchmarks.md"].map(|name| root().join(name))
 }
@@ -37,14 +40,14 @@ fn csv_text(name: &str) -> String {
     fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// Returns the rows of a CSV file. Lines that begin with `#` are no rows.
+/// Returns the rows of `docs/benchmarks/NAME.csv` for the name `name`, without comment lines, which begin with `#`.
 fn rows(name: &str) -> Rows {
     let text = csv_text(name);
     let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(text.as_bytes());
     reader.deserialize().collect::<Result<_, _>>().unwrap_or_else(|error| panic!("{name}.csv: {error}"))
 }
 
-/// Returns the conditions `A=B,C=D` as pairs.
+/// Parses conditions such as `model=deform2,kept=10%`. Returns the pairs (column, required value).
 fn conditions(text: &str) -> Vec<(String, String)> {
     let pairs = text.split(',').filter(|pair| !pair.is_empty());
     pairs.map(|pair| pair.split_once('=').expect("COLUMN=VALUE")).map(|(a, b)| (a.to_owned(), b.to_owned())).collect()
@@ -54,7 +57,8 @@ fn fulfils(row: &BTreeMap<String, String>, conditions: &[(String, String)]) -> b
     conditions.iter().all(|(column, value)| row.get(column) == Some(value))
 }
 
-/// Returns the value as the format `how` writes it; a dash if it is empty.
+/// Returns the text of a table cell: `value`, the text in the CSV file, in the format `how` (see the top of this file).
+/// An empty `value` becomes a dash, and `inf` becomes `exact`.
 fn formatted(value: &str, how: &str) -> String {
     if value.is_empty() {
         return "–".to_owned();
@@ -98,7 +102,11 @@ fn table_of(comment: &str) -> Vec<String> {
     combinations.iter().map(|key| written(key)).collect()
 }
 
-/// Returns the text of one cell: that of its column in the combination `key`, or a value of a file.
+/// Returns the text of one table cell. `cell` describes it, as the comment above the table does (see the top of this
+/// file).
+///
+/// - `base` and `filter`: name of the CSV file of the table, and the conditions for its rows.
+/// - `key`: values of the key columns in this row of the table, as pairs (column, value).
 fn cell_of(cell: &str, base: &str, filter: &[(String, String)], key: &[(String, String)]) -> String {
     let Some((place, how)) = cell.rsplit_once(':') else {
         return key.iter().find(|(column, _)| column == cell).unwrap().1.clone();
@@ -116,7 +124,8 @@ fn cell_of(cell: &str, base: &str, filter: &[(String, String)], key: &[(String, 
     rows.iter().find(fits).map_or("–".to_owned(), |row| formatted(&row[column], how))
 }
 
-/// Returns `text` with the rows of each table replaced by those that its comment describes.
+/// Returns the Markdown page `text` with new rows in each table that has a comment `<!-- cells of … -->`. The rows are
+/// made from the CSV files as this comment describes.
 fn with_tables(text: &str) -> String {
     let (mut written, mut lines) = (String::new(), text.lines().peekable());
     while let Some(line) = lines.next() {

@@ -56,8 +56,8 @@ fn send(signal: &str, child: &Child) {
     assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
 }
 
-/// Returns a command that runs the program as in a container: in a process id namespace of its own, with a process id
-/// above `before`.
+/// Returns a command that runs the program as in a container: in a namespace of process ids of its own, in which the
+/// program's id is above `before`.
 fn in_container(workplace: &Workplace, before: usize, arguments: &str) -> Command {
     let mut command = crate::unshare(&["-p", "--fork", "--mount-proc"]);
     // Processes that have ended take every process id up to `before`.

@@ -118,7 +118,8 @@ fn shell_commands(line: &str) -> Vec<Vec<String>> {
     commands
 }
 
-/// Returns the arguments of the program if the command `words` runs it, directly or by `cargo run`.
+/// Returns the arguments of `splatsieve` if the shell command `words` runs it, directly or by `cargo run`. Returns
+/// `None` for other commands.
 fn arguments(words: &[String]) -> Option<&[String]> {
     match words {
         [name, rest @ ..] if name == "splatsieve" => Some(rest),
@@ -131,7 +132,8 @@ fn arguments(words: &[String]) -> Option<&[String]> {
     }
 }
 
-/// Returns the arguments of every call of the program in `text`, in shell blocks and between single backquotes.
+/// Returns the arguments of every call of `splatsieve` in `text`, in shell blocks and between single backquotes. Each
+/// call is a list of arguments.
 ///
 /// Calls with words in capitals, such as `splatsieve COMMAND -h`, are patterns and are left out.
 fn calls(text: &str) -> Vec<Vec<String>> {
@@ -144,7 +146,7 @@ fn calls(text: &str) -> Vec<Vec<String>> {
     called.filter(|arguments| !arguments.is_empty() && !arguments.iter().take(2).any(is_form)).collect()
 }
 
-/// Runs the program in `workplace` without standard input and returns its standard error and whether it succeeded.
+/// Runs the program in `workplace` without standard input. Returns whether it succeeded, and its standard error.
 fn run(workplace: &Workplace, arguments: &[String]) -> (bool, String) {
     let mut command = Command::new(program());
     let output = command.current_dir(workplace.path(".")).args(arguments).stdin(Stdio::null()).output().unwrap();

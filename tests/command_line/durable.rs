@@ -49,7 +49,8 @@ enum Call {
     Rename(PathBuf, PathBuf),
 }
 
-/// Runs the program and returns all its `fsync` and `rename` calls in order.
+/// Runs the program with the preloaded library `shim`, which records system calls. Returns all `fsync` and `rename`
+/// calls of the program in order.
 fn recorded_calls(workplace: &Workplace, shim: &Path, arguments: &str) -> Vec<Call> {
     let notes = workplace.path("notes");
     let _ = fs::remove_file(&notes);

@@ -467,7 +467,8 @@ fn scripts_report_errors_without_a_traceback() {
     assert_eq!(String::from_utf8_lossy(&output.stderr), "");
 }
 
-/// The buffers of a run of 300 Gaussians and 10 frames take at most 60 MiB.
+/// Checks the minimum memory that a refused run names: for a run of 300 Gaussians and 10 frames it is at most 60 MiB,
+/// and a run with this limit succeeds and keeps the limit.
 #[test]
 fn named_minimum_memory_is_small_and_kept() {
     let workplace = Workplace::new();

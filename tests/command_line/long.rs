@@ -1,6 +1,6 @@
-//! Very long and very wide sequences, as files and as streams of unknown length (case 42 of the table in
-//! `tests/extremes/main.rs`). A memory limit holds for as many frames as fit, and a run refuses more frames than that
-//! with a message that names the limit.
+//! Tests of very long and very wide sequences, as files and as streams of unknown length (case 42 of the table in
+//! `tests/extremes/main.rs`). A run stays within its memory limit for as many frames as the limit allows. It refuses a
+//! longer stream with a message that names the limit.
 //!
 //! `SPLATSIEVE_PROGRAM` may name an optimized program to run in place of the one built with this test.
 
@@ -14,8 +14,8 @@ use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
 
-/// Options for scoring and pruning by formula. Stages that use renders take much time but no memory that grows with
-/// frames.
+/// Options for a run that scores and prunes without renders, so that the tests are fast. Renders would take no memory
+/// that grows with the number of frames.
 const REQUEST: &str = "--set coverage=projected --prune-only --no-refine --set choose_by_views=false --ratio 0.5 \
      --set bands=all";
 
@@ -111,14 +111,14 @@ fn million_gaussians_in_two_frames_fit() {
     check_file_and_stream(LongSequence { gaussians: 1_000_000, frames: 2 }, 700);
 }
 
-/// Case 42 of the table in `tests/extremes/main.rs`: many frames.
+/// Runs a sequence of a million frames with ten Gaussians (case 42 of the table in `tests/extremes/main.rs`).
 #[test]
 #[ignore = "slow: minutes unless optimized"]
 fn slow_a_million_frames_of_ten_gaussians_fit_64_mib() {
     check_file_and_stream(LongSequence { gaussians: 10, frames: 1_000_000 }, 64);
 }
 
-/// Case 42 of the table in `tests/extremes/main.rs`: many Gaussians.
+/// Runs a sequence of two frames with ten million Gaussians (case 42 of the table in `tests/extremes/main.rs`).
 #[test]
 #[ignore = "slow: minutes unless optimized"]
 fn slow_ten_million_gaussians_in_two_frames_fit() {

@@ -11,11 +11,11 @@ use splatsieve::models::trajectories::write_sequence;
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::progress::Events;
 
-/// Number of frames: two full frame blocks and one that is not full.
+/// Number of frames of the test scene: two full frame blocks of 32 frames, and one block that is not full.
 const FRAMES: usize = 70;
 
-/// Returns a folder with `scene.gseq`, `smaller.gseq` with fewer Gaussians, and `cameras.json`: small images of three
-/// views, of which one ends after 40 frames.
+/// Returns a folder with `scene.gseq` of `gaussians` Gaussians, `smaller.gseq` with fewer, and `cameras.json` with
+/// three small cameras. Two of the cameras see every frame, one only the first 40.
 fn workplace(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
     let made = DemoScene::new(gaussians, FRAMES);
@@ -276,8 +276,8 @@ fn damaged_shards_are_computed_again() {
     }
 }
 
-/// Checks that compressing in shards writes the same files as one run. Returns the names of the stages that were
-/// divided.
+/// Checks that compressing in shards writes the same files as one run. `line` holds additional arguments of `compress`,
+/// and `numbers` the numbers of shards to test. Returns the names of the stages that were divided.
 fn assert_compresses_the_same(workplace: &Workplace, line: &str, numbers: &[usize]) -> BTreeSet<String> {
     let compress = format!("compress scene.gseq --cameras cameras.json -o out.gseq {line}");
     let outputs = ["out.gseq", "out.gseq.index_map.npy", "out.gseq.recipe.toml"];

@@ -1,5 +1,5 @@
-//! The PlayCanvas engine, in a browser, draws the `.sog` files that this program writes. `SPLATSIEVE_NODE_MODULES` names
-//! a folder `node_modules` with the package `playcanvas`.
+//! Tests that the PlayCanvas engine, in a browser, draws the `.sog` files of this program as the rasterizer does.
+//! `SPLATSIEVE_NODE_MODULES` names a folder `node_modules` with the package `playcanvas`.
 #![cfg(unix)]
 
 use std::fs;
@@ -29,7 +29,7 @@ fn large_gaussians() -> Gaussians {
     made
 }
 
-/// Returns the image that the engine draws of the file `sog` from `camera` on black.
+/// Returns the image that the PlayCanvas engine draws of the file `sog`, seen from `camera` on a black background.
 fn drawn(page: &mut Browser, workplace: &Workplace, sog: &str, camera: &Camera) -> Image {
     let engine = fs::canonicalize(modules().join("playcanvas/build/playcanvas.js")).unwrap();
     let rows = [0, 1, 2].map(|row| camera.rotation.row(row).to_array());

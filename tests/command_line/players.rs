@@ -17,8 +17,8 @@ use crate::scene::Workplace;
 /// Number of Gaussians in the test files.
 const COUNT: usize = 60;
 
-/// Returns Gaussians without any symmetry: each axis has another range of positions and other scales, and every SH
-/// coefficient is different.
+/// Returns 60 Gaussians of SH degree `degree` without any symmetry: each axis has another range of positions and other
+/// scales, and every SH coefficient is different.
 pub(crate) fn asymmetrical(degree: usize) -> Gaussians {
     let mut made = Gaussians::zeros(COUNT, degree);
     let fill = |values: &mut [f32], seed: usize, middle: f32, width: f32| {
@@ -40,13 +40,13 @@ pub(crate) fn asymmetrical(degree: usize) -> Gaussians {
     made
 }
 
-/// Returns the folder with the packages of other programs.
+/// Returns the folder `node_modules` with the packages of other programs, which `SPLATSIEVE_NODE_MODULES` names.
 pub(crate) fn modules() -> PathBuf {
     let folder = std::env::var_os("SPLATSIEVE_NODE_MODULES").expect("SPLATSIEVE_NODE_MODULES names a node_modules");
     PathBuf::from(folder)
 }
 
-/// Converts the file `from` to `to` with splat-transform.
+/// Converts the file `from` to `to` with the program splat-transform and its command-line options `options`.
 fn splat_transform(workplace: &Workplace, from: &str, to: &str, options: &[&str]) {
     let program = modules().join("@playcanvas/splat-transform/bin/cli.mjs");
     let mut node = Command::new("node");
@@ -59,7 +59,7 @@ fn read(path: &Path) -> Gaussians {
     gather_all(open(path, &OpenOptions::default()).unwrap().source(), 0, Attributes::all()).unwrap()
 }
 
-/// Returns the Gaussians in increasing order of x, which identifies them.
+/// Returns the Gaussians sorted by their x coordinates, so that two files with other orders can be compared.
 fn sorted(gaussians: &Gaussians) -> Gaussians {
     let mut rows: Vec<u32> = (0..gaussians.len() as u32).collect();
     let x = gaussians.position.plane(0);
@@ -67,14 +67,16 @@ fn sorted(gaussians: &Gaussians) -> Gaussians {
     gaussians.pick(&rows)
 }
 
-/// Maximum differences between two readings of a file, or between a file and its original.
+/// Maximum allowed differences between the Gaussians that two programs read from a file, or between a file and its
+/// original.
 struct Steps {
     position: f64,
     log_scale: f64,
     sh: f64,
 }
 
-/// Asserts that the Gaussians are the same within `steps`, in any order; colors within 1/255.
+/// Checks that `found` and `expected` have the same Gaussians in any order, within the differences `steps` and, for
+/// colors and opacities, 1/255. `what` names the case in failures.
 fn assert_near(found: &Gaussians, expected: &Gaussians, steps: &Steps, what: &str) {
     assert_eq!((found.len(), found.sh_degree()), (expected.len(), expected.sh_degree()), "{what}");
     let [found, expected] = [found, expected].map(sorted);
@@ -107,10 +109,12 @@ fn quaternion(gaussians: &Gaussians, i: usize) -> DQuat {
     DQuat::from_xyzw(x, y, z, w).normalize()
 }
 
-/// Signs of the SH coefficients above degree 0 when y and z are reversed, from the parity of the basis functions.
+/// Signs by which the SH coefficients above degree 0 are multiplied if the y and z axes are reversed. They follow from
+/// the parity of the basis functions.
 const REVERSED_YZ: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
-/// Returns the Gaussians with the y and z axes reversed.
+/// Returns the Gaussians turned by 180° about the x axis, which reverses the y and z axes: positions, rotations and SH
+/// coefficients change.
 pub(crate) fn reversed(gaussians: &Gaussians) -> Gaussians {
     let mut turned = gaussians.clone();
     for axis in [1, 2] {
@@ -223,7 +227,8 @@ fn fourdgs_reads_our_4dgs_files() {
     }
 }
 
-/// Returns the Gaussians of a frame: every Gaussian moves at its own speed, and none passes another in x.
+/// Returns the Gaussians as they are at the frame number `frame`. Each moves along y and z at a speed of its own, and
+/// keeps its x coordinate.
 pub(crate) fn moved(gaussians: &Gaussians, frame: usize) -> Gaussians {
     let mut moved = gaussians.clone();
     for axis in [1, 2] {

@@ -6,7 +6,7 @@ use serde_json::Value;
 use splatsieve::pipeline::summary::{SCHEMA, Summary};
 
 /// Runs a compression with `arguments`, and again with the recipe that the first run wrote. Checks that both write the
-/// same files. Returns the first run.
+/// same files. Returns the second run. `name` is the start of the names of both outputs.
 fn assert_recipe_repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
     let first = workplace.run(&format!("compress {arguments} -o {name}_first"));
     assert_eq!(first.code, 0, "{}", first.stderr);

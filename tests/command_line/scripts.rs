@@ -21,14 +21,15 @@ fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts").join(name)
 }
 
-/// Runs Python in the workplace, checks that it succeeds and returns its standard output.
+/// Runs `command`, a call of Python, in the workplace. Checks that it succeeds and returns its standard output.
 fn run(command: &mut Command, workplace: &Workplace) -> Vec<u8> {
     let output = command.current_dir(workplace.path("")).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     output.stdout
 }
 
-/// Runs `exporter`, which writes a frame stream to standard output, converts the stream to a container and opens it.
+/// Runs `exporter`, a program that writes a frame stream to standard output. Converts the stream to the container
+/// `name` and opens it.
 fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Container {
     let stream = run(exporter, workplace);
     fs::write(workplace.path("stream"), stream).unwrap();
@@ -42,7 +43,8 @@ fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Containe
     Container::open(&workplace.path(name)).unwrap()
 }
 
-/// Writes the values of the scene at `frame` as float32 files, one per attribute, Gaussian by Gaussian.
+/// Writes the values of the scene at `frame` as float32 files, one per attribute: first all components of Gaussian 0,
+/// then those of Gaussian 1, and so on.
 fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
     let state = state(scene, frame);
     for column in Attributes::all().iter() {
@@ -318,7 +320,7 @@ fn bars_fit_the_terminal_and_leave_no_line_behind() {
     assert_eq!(String::from_utf8(said).unwrap().matches("all fit").count(), 3);
 }
 
-/// Tests of the Python package itself: compress, streams, containers and refusals, through the installed module.
+/// Runs the tests of the installed Python package: compressing, streams, containers and refusals.
 #[test]
 #[ignore = "needs maturin, numpy and zstandard"]
 fn installed_python_package_passes_its_tests() {

@@ -28,8 +28,9 @@ fn valid_gaussian(i: usize) -> SplatvGaussian {
     }
 }
 
-/// Returns the texture rows of Gaussians, one each, some with defects: row 3 has no position, row 10 neither position
-/// nor rotation, rows 20 to 24 no rotation, row 30 no width; rows 40 to 47 have infinite temporal widths.
+/// Returns 200 Gaussians encoded as rows of a `.splatv` texture. Some have defects: row 3 has no valid position, row 10
+/// neither position nor rotation, rows 20 to 24 no rotation, row 30 no width. Rows 40 to 47 have infinite temporal
+/// widths.
 fn rows() -> Vec<[u32; WORDS_PER_GAUSSIAN]> {
     let mut rows: Vec<[u32; WORDS_PER_GAUSSIAN]> = (0..ROWS).map(|i| encode_words(&valid_gaussian(i))).collect();
     rows[3][1] = f32::NAN.to_bits();
@@ -42,7 +43,8 @@ fn rows() -> Vec<[u32; WORDS_PER_GAUSSIAN]> {
 
 const DROPPED: [usize; 8] = [3, 10, 20, 21, 22, 23, 24, 30];
 
-/// Writes a file whose texture ends after the last row, as numpy's `tobytes` leaves it.
+/// Writes the texture rows `rows` to a `.splatv` file, which ends after the last row without padding, as numpy's
+/// `tobytes` leaves it.
 fn write(path: &Path, rows: &[[u32; WORDS_PER_GAUSSIAN]]) {
     let text = r#"[{"type":"splat","size":65536,"texwidth":4096,"texheight":1,"cameras":[]}]"#;
     let mut bytes = [MAGIC.to_le_bytes(), (text.len() as u32).to_le_bytes()].concat();

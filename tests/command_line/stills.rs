@@ -24,7 +24,7 @@ pub(crate) fn scattered(count: usize) -> Gaussians {
     made
 }
 
-/// Writes a PLY of 40 Gaussians without any symmetry. Returns them.
+/// Writes 40 Gaussians without any symmetry to the PLY file `name`, and returns them.
 fn write_ply(workplace: &Workplace, name: &str) -> Gaussians {
     let made = scattered(40);
     workplace.ply(name, &made);

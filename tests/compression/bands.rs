@@ -10,8 +10,8 @@ use crate::scene::{
 };
 use serde_json::Value;
 
-/// Name of the stage in the summary's list of omitted work. The list has it if the stage runs and removes
-/// nothing.
+/// Name of SH degree reduction in the summary's list of omitted work. The list has this name, with a reason, if the
+/// recipe asks for the reduction but no coefficients are removed.
 const LOWER_DEGREE: &str = "lower SH degree";
 
 /// Writes a copy of the tiny model to `model` in the workplace. The copy has no SH head, and its coefficients above

@@ -11,8 +11,8 @@ fn len(path: &Path) -> u64 {
     fs::metadata(path).unwrap().len()
 }
 
-/// Name of the stage in the summary's list of omitted work. The list has it if the stage runs and keeps
-/// the field in full precision.
+/// Name of the conversion to half precision in the summary's list of omitted work. The list has this name, with a
+/// reason, if the stage runs and keeps the field in full precision.
 const HALF_PRECISION: &str = "half precision of the field";
 
 const QUICKLY: &str = "{tiny} --cameras {tiny} --no-refine --prune-only --overwrite";

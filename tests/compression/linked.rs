@@ -32,8 +32,8 @@ fn write_row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
     out.sh.set_row(at, [13, 14, 15].map(|k| 3.0 * value(k) - 1.5));
 }
 
-/// Returns the state at frame `frame` of those of the Gaussians `0..count` for which `is_alive` is true, and their ids.
-/// Their order differs from frame to frame.
+/// Returns the state at frame `frame` of the Gaussians that are alive, and their ids. Gaussian `i`, from 0 to `count` −
+/// 1, is alive if `is_alive(i)` is true. The order of the Gaussians differs from frame to frame.
 fn frame(count: usize, frame: usize, is_alive: impl Fn(usize) -> bool) -> (Gaussians, Vec<usize>) {
     let mut order: Vec<usize> = (0..count).filter(|&i| is_alive(i)).collect();
     order.sort_by_key(|&i| hash_id((i as u64) << 20 | frame as u64));
@@ -157,8 +157,8 @@ fn frames_are_written_with_the_gaussians_alive_in_them() {
     workplace.done("info half");
 }
 
-/// Returns the state at frame `t` of a scene in which every Gaussian is replaced by a copy every seven frames. The old
-/// one fades out over two frames while the new one fades in. Both together are as opaque as one Gaussian of
+/// Returns the state at frame `t` of `count` Gaussians, each of which is replaced by a copy every seven frames. The old
+/// copy fades out over two frames while the new one fades in. Both together are as opaque as one Gaussian of
 /// `write_row`.
 fn fading_frame(count: usize, t: usize) -> Gaussians {
     let parts = |i: usize| match (t + (hash_id(i as u64) % 7) as usize) % 7 {
@@ -221,8 +221,8 @@ fn lives_that_fade_into_one_another_become_one_track() {
     assert!(fs::read_to_string(workplace.path("apart/recipe.toml")).unwrap().contains("link = \"apart\""));
 }
 
-/// Returns the state at frame `t` of Gaussians whose attributes vary by different amounts, so that each attribute is
-/// steady in some Gaussians and not in others.
+/// Returns the state at frame `t` of `count` Gaussians whose attributes vary by different amounts, so that each
+/// attribute is steady in some Gaussians and not in others. The order of the Gaussians differs from frame to frame.
 fn varying_frame(count: usize, t: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for i in 0..count {
@@ -247,7 +247,7 @@ fn varying_frame(count: usize, t: usize) -> Gaussians {
     out.pick(&order)
 }
 
-/// Computes, for one track, the numbers that decide whether attributes count as constant along it
+/// Computes the numbers that decide whether the attributes of Gaussian `track` in all `frames` count as constant
 /// (`src/models/linked/steady.rs`), in f64. Returns for rotation, scales, opacity logit and colors the mean, and the
 /// variation divided by its bound.
 fn mean_and_variation(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {

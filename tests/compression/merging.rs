@@ -18,7 +18,8 @@ use splatsieve::scene::{InputOptions, Scene, open_scene};
 /// Change of the merging parameters that makes one of the tests for a pair stricter.
 type Tighten = fn(&mut MergeParams);
 
-/// Model with all its frames in memory.
+/// Model with the states of all its frames in memory, and for each frame whether each Gaussian is alive (opacity ≥
+/// 0.01).
 struct AllFrames {
     frames: Vec<Gaussians>,
     alive: Vec<Vec<bool>>,
@@ -64,8 +65,8 @@ fn covariance(state: &Gaussians, i: usize) -> DMat3 {
     axes * DMat3::from_diagonal(scale * scale) * axes.transpose()
 }
 
-/// Returns whether two nodes (Gaussians or merged groups) with these states pass tests 1 (place and size) and 2 (color)
-/// of merging.
+/// Returns whether the nodes (Gaussians or merged groups) in rows `i` and `j` of `state` pass tests 1 (place and size)
+/// and 2 (color) of merging.
 fn passes_tests_1_and_2(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &MergePass) -> bool {
     let sigma = (covariance(state, i) + covariance(state, j)) * 0.5;
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
@@ -92,7 +93,8 @@ fn passes_tests_1_and_2(state: &Gaussians, i: usize, j: usize, merge: &MergePara
         && (color(i) - color(j)).length() <= merge.max_color_difference
 }
 
-/// Returns whether two Gaussians pass test 3 (motion) of merging.
+/// Returns whether the Gaussians `i` and `j` pass test 3 (motion) of merging, with the thresholds of the merging pass
+/// `pass`.
 fn passes_test_3(all_frames: &AllFrames, i: usize, j: usize, recipe: &Recipe, pass: &MergePass) -> bool {
     let merge = &recipe.merge;
     let unit = merge.length_unit.in_scene_units(all_frames.extent);
@@ -126,8 +128,8 @@ fn passes_test_3(all_frames: &AllFrames, i: usize, j: usize, recipe: &Recipe, pa
     similarity > pass.tau_m && drift <= merge.max_drift * unit && dead <= merge.max_dead_time
 }
 
-/// Returns the clusters by the plain implementation, as lists of ids with the leader first. Clusters are in increasing
-/// order of their leaders.
+/// Returns the clusters that merging must find among the Gaussians `kept`, by a plain implementation of the rules. A
+/// cluster is a list of ids with the leader first. Clusters are in increasing order of their leaders.
 fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Recipe) -> Vec<Vec<usize>> {
     let merge = &recipe.merge;
     let unit = merge.length_unit.in_scene_units(all_frames.extent);
@@ -178,7 +180,8 @@ fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Re
     groups
 }
 
-/// Returns the ids of a cluster in ascending order, each with its weight in the proxy, which is proportional to C·Vis.
+/// Returns the ids of the cluster `group` in ascending order, each with its weight in the proxy. Weights are
+/// proportional to C·Vis and sum to 1.
 fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
     let mut ids = group.to_vec();
     ids.sort_unstable();
@@ -194,8 +197,8 @@ fn options(output: &Path, recipe: &Recipe, only: PruneOrMerge) -> Request {
     Request { only, ..Request::new(input, output.to_owned(), recipe.clone()) }
 }
 
-/// Compresses the tiny model and checks its clusters and proxies. Returns the number of Gaussians that were merged into
-/// the leader of their cluster.
+/// Compresses the tiny model with merging, and checks the clusters and proxies of the result. `only` selects pruning,
+/// merging or both. Returns the number of Gaussians that were merged into the leader of their cluster.
 fn assert_merges_as_specified(recipe: &Recipe, only: PruneOrMerge) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");

@@ -24,7 +24,8 @@ const COLOR_KEY: &str = concat!("col", "our");
 /// off by up to 8e-9 there.
 const CANCELLED: f64 = 1e-9;
 
-/// Largest differences of the values that a renderer reads, over all Gaussians and all recorded frames.
+/// Largest differences between the frame states of a model as this program computes them and as its trainer's code
+/// recorded them, over all Gaussians and all recorded frames.
 #[derive(Debug, Default)]
 struct StateErrors {
     position: f64,
@@ -110,8 +111,8 @@ fn dynamic_3d_gaussians_states_match_their_trainer() {
     }
 }
 
-/// Returns three largest differences, for models that record covariances: of position, of opacity, and of the
-/// covariance relative to its largest entry.
+/// Returns the largest differences between the frame states of this program and those that the trainer's code recorded,
+/// for models that record covariances: of position, of opacity, and of the covariance relative to its largest entry.
 fn covariance_errors(scene: &Scene, model: &Path) -> [f64; 3] {
     let expected = arrays(&model.join("states.npz"));
     let (source, mut errors) = (scene.source(), [0.0f64; 3]);
@@ -426,8 +427,8 @@ fn every_command_accepts_models_of_control_nodes() {
     check_every_command(&[("scgs", "deform2", "SC-GS", 1500.0)]);
 }
 
-/// A network evaluated for every Gaussian takes half an hour without optimization; run this test by name, with
-/// `SPLATSIEVE_PROGRAM`.
+/// Runs every command on models whose network is evaluated for every Gaussian. This takes half an hour without
+/// optimization, so this test runs only by name, with `SPLATSIEVE_PROGRAM`.
 #[test]
 #[ignore = "slow: half an hour unless optimized"]
 fn slow_every_command_accepts_deep_networks() {

@@ -27,7 +27,8 @@ fn held_out(cameras: &Value) -> Value {
     json!({"frames": cameras.iter().enumerate().map(frame).collect::<Vec<_>>()})
 }
 
-/// Returns the curves of the varied setting `knob`.
+/// Returns the curves of the setting `knob` in `found`, the JSON that `precision` prints. A curve has the errors at all
+/// measured values of the setting.
 fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
     let knobs = found["knobs"].as_array().unwrap();
     knobs.iter().find(|entry| entry["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"]
@@ -35,7 +36,7 @@ fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
         .unwrap()
 }
 
-/// Returns the errors of kind `kind` at all measured values of a curve.
+/// Returns the errors of the kind `kind` in `curve` (JSON), one for each measured value of the varied setting.
 fn errors(curve: &Value, kind: &str) -> Vec<f64> {
     curve["marks"].as_array().unwrap().iter().map(|mark| mark["errors"][kind].as_f64().unwrap()).collect()
 }

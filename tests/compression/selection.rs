@@ -82,7 +82,8 @@ fn plain_scores(rows: &StatisticRows, recipe: &Recipe) -> PlainScores {
     PlainScores { static_score, dynamic_score, score: sum, keep }
 }
 
-/// Compares a run with the formulas. Returns how many Gaussians were kept.
+/// Checks that the scores, thresholds and survivors of the program agree with the plain implementation for `recipe`.
+/// Returns the number of Gaussians that were kept.
 fn assert_agrees(recipe: Recipe) -> usize {
     let scored = scored(&recipe);
     let expected = plain_scores(&scored.rows().unwrap(), &recipe);

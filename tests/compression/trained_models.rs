@@ -13,8 +13,8 @@ fn assert_close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: got {got}, expected {expected}, tolerance {tolerance:e}");
 }
 
-/// Place of a value in a model, for messages. It is formatted only if a comparison fails, because millions of values
-/// are compared.
+/// Description of a compared value for messages: model, attribute, Gaussian and frame. It is formatted only if a
+/// comparison fails, because millions of values are compared.
 struct At<'a, F> {
     model: &'a Path,
     what: &'a str,
@@ -36,8 +36,8 @@ fn extent(state: &Gaussians) -> f64 {
     (0..3).map(|c| side(state.position.plane(c))).fold(0.0, f64::max)
 }
 
-/// Reads the scene from point cloud, configuration, field and cameras, and compares the frames that `states.npz` lists
-/// by number. This also checks that the cameras give the times of training.
+/// Compares the frame states of the trained model in the folder `model` with `states.npz`, which has states computed by
+/// PyTorch for some frames. Also checks that the cameras give the times of training.
 fn frames_agree(model: &Path) {
     let expected = arrays(&model.join("states.npz"));
     let scene = crate::scene::scene(model);
@@ -87,13 +87,16 @@ fn rows(model: &Path, motion: MotionParams) -> (StatisticRows, f64) {
     (scored.rows().unwrap().into_owned(), scored.position_ulp)
 }
 
-/// Compares the statistics of all frames for both definitions of motion.
+/// Compares the statistics D, κ, V and life of the trained model in the folder `model` with those that PyTorch computed
+/// in float64, for both definitions of motion.
 ///
-/// The tolerances follow from the f32 frame states. A position is off by its own rounding, half an ulp of the largest
-/// coordinate, and by that of the sums in the field, which are smaller numbers: e ≤ 1 ulp on each axis. A step is off
-/// by at most 2√3·e, and so is the root mean square D; a second difference by 4√3·e, and so is κ (measured: D 0.7 ulp,
-/// κ 1.2 ulp). An opacity is off by a ≤ 1e-6; hence V, a mean of squares of deviations d, by 2·mean|d|·2a + 4a² ≤ 4a·√V
-/// + 4a².
+/// The tolerances follow from the f32 frame states:
+/// - A position is off by its own rounding, half an ulp of the largest coordinate, and by that of the sums in the
+///   field, which are smaller numbers: e ≤ 1 ulp on each axis.
+/// - A step is off by at most 2√3·e, and so is the root mean square D. A second difference is off by at most 4√3·e, and
+///   so is κ (measured: D 0.7 ulp, κ 1.2 ulp).
+/// - An opacity is off by a ≤ 1e-6. V is a mean of squares of deviations d, so it is off by at most 2·mean|d|·2a + 4a²
+///   ≤ 4a·√V + 4a².
 fn statistics_agree(model: &Path) {
     let expected = arrays(&model.join("statistics_f64.npz"));
     for (motion, name) in [(MotionParams::Literal, "literal"), (MotionParams::Runs, "runs")] {

@@ -49,7 +49,7 @@ pub(crate) struct Entry {
 }
 
 impl Entry {
-    /// Reads `bytes` as they are, and with repaired checksums.
+    /// Calls the reader with `bytes` as they are, and with repaired checksums. The reader may write to `folder`.
     ///
     /// # Panics
     /// Panics if the reader panics, uses more memory than the limit, or reports an error in Rust terms.
@@ -274,9 +274,9 @@ fn archive(bytes: &[u8], folder: &InputFolder) -> Outcome {
     if layout.is_some() { model(&folder.write_file("a.gsz", bytes)) } else { Ok(()) }
 }
 
-/// Reads an archive whose sections this function compresses. `bytes` has three lengths, then the sections table, point
-/// cloud, field and blobs, table and blobs without compression: most changes of compressed bytes would only make
-/// decompression fail.
+/// Builds an archive from `bytes` and reads it. `bytes` holds the lengths of three sections (4 bytes each), then the
+/// sections uncompressed: table, point cloud, field, and blobs as the rest. This function compresses the table and the
+/// blobs, because most changes of compressed bytes would only make decompression fail.
 fn archive_sections(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let mut rest = bytes.get(12..).unwrap_or_default();
     let mut sections: [&[u8]; 4] = [&[]; 4];
@@ -309,8 +309,9 @@ fn cameras(bytes: &[u8], folder: &InputFolder) -> Outcome {
     Ok(())
 }
 
-/// Reads COLMAP files, first as binary and then as text files. `bytes` has the length of `cameras`, then the contents
-/// of `cameras` and `images`.
+/// Reads `bytes` as a pair of COLMAP files, once as binary and once as text files. `bytes` has the length of the file
+/// `cameras` in 4 bytes, then the contents of the files `cameras` and `images`. Succeeds if one of the two readings
+/// does.
 fn colmap(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let rest = bytes.get(4..).unwrap_or_default();
     let (cameras, images) = rest.split_at((number::<4>(bytes, 0).unwrap_or(0) as usize).min(rest.len()));
@@ -324,7 +325,7 @@ fn colmap(bytes: &[u8], folder: &InputFolder) -> Outcome {
     Ok(binary.or(text)?)
 }
 
-/// Opens a model of any format and reads its first and last frame. If it has no times of its own, gives it two.
+/// Opens a model of any format and reads its first and last frame. A model without times of its own gets two times.
 fn model(path: &Path) -> Outcome {
     let mut model = models::open(path, &OpenOptions::default())?;
     if model.source().info().times.is_empty() {
@@ -333,7 +334,8 @@ fn model(path: &Path) -> Outcome {
     read_first_and_last_frame(model.source())
 }
 
-/// Reads the bytes twice: as a single file, whose format is known from its content, and as a file of a model folder.
+/// Reads the checkpoint `bytes` twice: as a single file, whose format is known from its content, and as a file of a
+/// model folder. Succeeds if one of the two readings does.
 fn checkpoint(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let alone = model(&folder.write_file("a.pt", bytes));
     folder.write_file("of_splats/chkpnt7.pth", bytes);
@@ -367,7 +369,8 @@ fn tsog(bytes: &[u8], folder: &InputFolder) -> Outcome {
     model(&folder.write_file("a.tsog", bytes))
 }
 
-/// Reads a file of one frame with a memory limit of 8 MiB, because a small file may declare any number of Gaussians.
+/// Reads `bytes` as the file `name`, which has one frame, with a memory limit of 8 MiB. The limit is needed because a
+/// small file may declare any number of Gaussians.
 fn still(name: &str, bytes: &[u8], folder: &InputFolder) -> Outcome {
     let path = folder.write_file(name, bytes);
     let options = OpenOptions {
@@ -413,7 +416,7 @@ fn ply(bytes: &[u8], folder: &InputFolder) -> Outcome {
     model(&folder.write_file("a.ply", bytes))
 }
 
-/// Checks only the header of a PLY, in memory, without writing or opening a file.
+/// Reads `bytes` as the header of a PLY, in memory, without writing or opening a file.
 fn ply_header(bytes: &[u8], _: &InputFolder) -> Outcome {
     check_header(bytes, Path::new("a.ply"))?;
     Ok(())
@@ -445,8 +448,8 @@ fn write_checksum(bytes: &mut [u8], range: std::ops::Range<usize>, at: usize) ->
     Some(())
 }
 
-/// Returns a zip archive with repaired checksums. Its directory has offset, length and checksum of each file, and each
-/// file has its checksum too.
+/// Returns the zip archive `bytes` with repaired checksums; `None` if they cannot be located. The directory of an
+/// archive has the offset, length and checksum of each file, and each file has its checksum too.
 fn repair_zip(bytes: &[u8]) -> Option<Vec<u8>> {
     let mut bytes = bytes.to_vec();
     let mut at = (0..bytes.len()).find(|&at| bytes[at..].starts_with(b"PK\x01\x02"))?;
@@ -469,8 +472,8 @@ fn repair_zip(bytes: &[u8]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Returns an archive (format/ARCHIVE.md) with repaired checksums. It has four sections after a header with their
-/// lengths and checksums.
+/// Returns the archive `bytes` (format/ARCHIVE.md) with repaired checksums; `None` if they cannot be located. An
+/// archive has four sections after a header with their lengths and checksums.
 fn repair_archive(bytes: &[u8]) -> Option<Vec<u8>> {
     let mut bytes = bytes.to_vec();
     let mut at = 116;
@@ -484,8 +487,8 @@ fn repair_archive(bytes: &[u8]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Returns a container (format/SPEC.md) with repaired checksums. It has a header, records at multiples of 64 bytes, an
-/// index with copies of the records, and a trailer.
+/// Returns the container `bytes` (format/SPEC.md) with repaired checksums; `None` if they cannot be located. A
+/// container has a header, records at multiples of 64 bytes, an index with copies of the records, and a trailer.
 fn repair_container(bytes: &[u8]) -> Option<Vec<u8>> {
     let mut bytes = bytes.to_vec();
     let header = usize::try_from(number::<4>(&bytes, 12)?).ok()?;

@@ -13,7 +13,8 @@ fn numbers(summary: &serde_json::Value, key: &str) -> Vec<f64> {
     summary["terms"].as_array().unwrap().iter().map(|term| term[key].as_f64().unwrap()).collect()
 }
 
-/// Case 1 of the table in `main.rs`.
+/// An input without Gaussians (case 1 of the table in `main.rs`) gives an output without Gaussians that commands can
+/// read.
 #[test]
 fn no_gaussians_give_a_valid_empty_output() {
     let workplace = Workplace::new();
@@ -29,7 +30,7 @@ fn no_gaussians_give_a_valid_empty_output() {
     }
 }
 
-/// Case 2 of the table in `main.rs`.
+/// An input of one Gaussian (case 2 of the table in `main.rs`) is written unchanged, whatever the request.
 #[test]
 fn one_gaussian_is_kept_byte_for_byte() {
     let workplace = Workplace::new();
@@ -40,7 +41,7 @@ fn one_gaussian_is_kept_byte_for_byte() {
     }
 }
 
-/// Case 3 of the table in `main.rs`.
+/// An input of one frame (case 3 of the table in `main.rs`) has no motion; the summary lists the omitted statistics.
 #[test]
 fn one_frame_is_static_and_noted() {
     let workplace = Workplace::new();
@@ -56,7 +57,8 @@ fn one_frame_is_static_and_noted() {
     assert!(rows["life"].iter().all(|&frames| frames == 1.0));
 }
 
-/// Case 6 of the table in `main.rs`.
+/// A hundred identical Gaussians (case 6 of the table in `main.rs`) are pruned to the requested number. Hashes of the
+/// ids decide which ones stay, not their order in the file.
 #[test]
 fn identical_gaussians_are_pruned_to_exact_count_by_hash() {
     let workplace = Workplace::new();
@@ -79,7 +81,7 @@ fn identical_gaussians_are_pruned_to_exact_count_by_hash() {
     }
 }
 
-/// Case 7 of the table in `main.rs`.
+/// In a sequence without motion (case 7 of the table in `main.rs`), neighbors merge and the dynamic score is not used.
 #[test]
 fn static_neighbors_merge_and_dynamic_scores_are_off() {
     let workplace = Workplace::new();
@@ -103,7 +105,7 @@ fn static_neighbors_merge_and_dynamic_scores_are_off() {
     assert!(frames.iter().all(|frame| frame.rows == frames[0].rows));
 }
 
-/// Case 8 of the table in `main.rs`.
+/// If about 1% of the Gaussians move (case 8 of the table in `main.rs`), pruning keeps all of these.
 #[test]
 fn all_movers_are_kept_at_around_one_percent() {
     for movers in [1, 2, 3] {
@@ -125,7 +127,7 @@ fn all_movers_are_kept_at_around_one_percent() {
     }
 }
 
-/// Case 9 of the table in `main.rs`.
+/// Gaussians with an opacity of almost 0 (case 9 of the table in `main.rs`) can be pruned to one, and no score is NaN.
 #[test]
 fn invisible_gaussians_are_prunable_without_nan() {
     for logit in [-100.0, -30.0] {
@@ -164,7 +166,8 @@ fn gaussians_like_their_background_use_the_contrast_floor() {
     }
 }
 
-/// Case 10 of the table in `main.rs`.
+/// Gaussians with an opacity of almost 1 (case 10 of the table in `main.rs`) have an opacity variance of 0, and proxies
+/// get finite opacity logits.
 #[test]
 fn solid_gaussians_have_no_variance_and_finite_logits() {
     let workplace = Workplace::new();
@@ -184,7 +187,7 @@ fn solid_gaussians_have_no_variance_and_finite_logits() {
     }
 }
 
-/// Case 18 of the table in `main.rs`.
+/// A Gaussian with NaN or infinity (case 18 of the table in `main.rs`) is refused, dropped or kept, as the recipe asks.
 #[test]
 fn nonfinite_gaussians_are_refused_dropped_or_kept() {
     let edits: [(&str, Edit); 5] = [
@@ -227,7 +230,8 @@ fn nonfinite_gaussians_are_refused_dropped_or_kept() {
     }
 }
 
-/// Case 28 of the table in `main.rs`.
+/// For an input without cameras (case 28 of the table in `main.rs`), the program places virtual cameras and says so in
+/// a note.
 #[test]
 fn without_cameras_a_virtual_rig_is_used_and_noted() {
     let workplace = Workplace::new();
@@ -239,7 +243,7 @@ fn without_cameras_a_virtual_rig_is_used_and_noted() {
     assert_eq!(summary["flags"]["never_in_view"], 0);
 }
 
-/// Case 40 of the table in `main.rs`.
+/// For an input without cameras, the survivors do not depend on the unit of length (case 40 of the table in `main.rs`).
 #[test]
 fn without_cameras_survivors_ignore_the_length_unit() {
     let kept = |power: i32| {
@@ -263,7 +267,8 @@ fn without_cameras_survivors_ignore_the_length_unit() {
     }
 }
 
-/// Case 31 of the table in `main.rs`: three copies, opacity by rule.
+/// Three copies of a Gaussian (case 31 of the table in `main.rs`) merge to one, with the opacity that the rule in the
+/// recipe gives.
 #[test]
 fn duplicates_merge_to_one_with_the_named_opacity_rule() {
     let workplace = Workplace::new();
@@ -288,7 +293,7 @@ fn duplicates_merge_to_one_with_the_named_opacity_rule() {
     }
 }
 
-/// Case 31 of the table in `main.rs`: any number of copies.
+/// Any number of copies of a Gaussian (case 31 of the table in `main.rs`) merges to one.
 #[test]
 fn any_number_of_duplicates_merges_to_one() {
     for count in [34, 100, 5000] {
@@ -299,7 +304,8 @@ fn any_number_of_duplicates_merges_to_one() {
     }
 }
 
-/// Case 43 of the table in `main.rs`.
+/// Frames with different numbers of Gaussians (case 43 of the table in `main.rs`) are refused if linking is off; the
+/// message names the file.
 #[test]
 fn frames_with_unequal_counts_are_named() {
     let workplace = Workplace::new();

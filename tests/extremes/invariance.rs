@@ -144,7 +144,8 @@ fn motion() -> impl Strategy<Value = MotionParams> {
     prop_oneof![Just(MotionParams::Runs), Just(MotionParams::Literal)]
 }
 
-/// Checks that `found` is `expected` within `relative` of its value or `absolute`.
+/// Checks that each value of `found` differs from that of `expected` by at most `relative` times the expected value
+/// plus `absolute`. `what` names the values in failures.
 fn check_near(what: &str, found: &[f64], expected: &[f64], relative: f64, absolute: f64) -> Result<(), TestCaseError> {
     for (i, (a, b)) in found.iter().zip(expected).enumerate() {
         let tolerance = relative * b.abs() + absolute;
@@ -222,8 +223,9 @@ proptest! {
         prop_assert_eq!(found.keep, expected.keep);
     }
 
-    /// The logarithm of a scale is rounded to f32, by up to 2^-21 at 28, and by 2^-22 when ln of the unit is added;
-    /// areas differ by four times as much.
+    /// Checks that a change of the unit of length changes areas and anisotropies only by rounding. A log scale is below
+    /// 32 in magnitude, so adding the logarithm of the unit rounds it by at most 2^-20 in f32. The tolerances are four
+    /// times this error.
     #[test]
     fn length_units_change_areas_only_by_rounding_of_scales(world in world(), power in 0i32..20) {
         let by = 2f64.powi(power);
@@ -283,8 +285,9 @@ proptest! {
         prop_assert_eq!(found.keep, expected.keep);
     }
 
-    /// Stamps are rounded by 1e-16 of their distance from 0, and a step by 2e-16 of that distance; with steps down to
-    /// 1e-6 of the duration a relative error of 1e-9 remains.
+    /// Checks that a change of the unit and the origin of time changes motion only by rounding. A time stamp is rounded
+    /// by 1e-16 of its distance from time 0, and a step between stamps by twice this. Steps may be as short as 1e-6 of
+    /// the duration, so their relative error is up to 1e-9.
     #[test]
     fn time_units_change_motion_only_by_rounding_of_stamps(
         world in world(), unit in -12f64..12.0, start in -3f64..3.0,

@@ -37,7 +37,8 @@ fn shift_along_x(cloud: &mut Gaussians, i: usize, by: f64) {
     cloud.position.plane_mut(0)[i] += by as f32;
 }
 
-/// Cases 13, 17 and 38 of the table in `main.rs`; each is checked next to a pair without the difference, which merges.
+/// Two Gaussians that move differently, teleport or live at different times (cases 13, 17 and 38 of the table in
+/// `main.rs`) do not merge. Each case is compared with a pair without the difference, which merges.
 #[test]
 fn different_motion_or_life_never_merges() {
     const T: usize = 12;
@@ -66,8 +67,8 @@ fn different_motion_or_life_never_merges() {
     }
 }
 
-/// Case 19 of the table in `main.rs`: any number of Gaussians that differ only in the signs of zeros, in 200 ways, are
-/// duplicates.
+/// Checks that 200 Gaussians that differ only in the signs of zeros are duplicates, and merge (case 19 of the table in
+/// `main.rs`).
 #[test]
 fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
     const N: usize = 200;
@@ -87,7 +88,8 @@ fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
     assert!(map[..N].iter().all(|&place| place == map[0]), "{map:?}");
 }
 
-/// Case 35 of the table in `main.rs`: coefficients of the same direction, one of which gives black.
+/// A black and a gray Gaussian, whose SH coefficients have the same direction, do not merge (case 35 of the table in
+/// `main.rs`).
 #[test]
 fn different_colors_never_merge() {
     let colored =
@@ -100,8 +102,8 @@ fn different_colors_never_merge() {
     assert_eq!(colored([[-1.78; 3], [-2.5; 3]]), 1);
 }
 
-/// Merges two equal Gaussians, changed by `edit`, to one. Returns the scales of the result, its axes as columns, and
-/// its PLY row.
+/// Merges two equal Gaussians, changed by `edit`, to one, by a run with the options `flags`. Returns the scales of the
+/// result, its axes as columns, and its PLY row.
 fn merge_two(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, PlyRows) {
     let workplace = Workplace::new();
     let mut cloud = balls(1).pick(&[0, 0]);
@@ -116,10 +118,12 @@ fn merge_two(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, Pl
     (scales, DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize()), rows)
 }
 
-/// Options with lengths in scene units. With them, pairs up to one unit apart merge, whatever their differences.
+/// Options for merging: lengths in scene units, a radius of 1, and thresholds of Mahalanobis distance, color cosine and
+/// motion that every pair passes.
 const WIDE: &str = "--set length_unit=scene --set passes=1,1e9,-1,-1";
 
-/// Case 21 of the table in `main.rs`, for needles along every axis and with any order of axes.
+/// A needle that merges with its duplicate keeps its smallest scale (case 21 of the table in `main.rs`), along every
+/// axis and in any order of the axes.
 #[test]
 fn needle_keeps_its_smallest_scale_through_a_ply() {
     for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
@@ -141,8 +145,9 @@ fn needle_keeps_its_smallest_scale_through_a_ply() {
     }
 }
 
-/// Case 22 of the table in `main.rs`: pancakes side by side in their common plane, of any orientation and flatness.
-/// Rotations in f32 limit the flatness: their error of 1e-7 moves a point at a distance of 0.02 by 2e-9.
+/// Flat Gaussians side by side in a common plane merge to a flat one (case 22 of the table in `main.rs`), for any
+/// orientation and thickness. Rotations in f32 limit how flat it is: their error of 1e-7 moves a point at a distance of
+/// 0.02 by 2e-9.
 #[test]
 fn coplanar_pancakes_stay_flat() {
     for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
@@ -167,8 +172,8 @@ fn coplanar_pancakes_stay_flat() {
     }
 }
 
-/// Case 23 of the table in `main.rs`: two balls along a diagonal have a covariance with equal diagonal entries, and the
-/// diagonal is its axis.
+/// Two balls along a diagonal merge to a Gaussian with this diagonal as an axis (case 23 of the table in `main.rs`).
+/// Its covariance has equal diagonal entries.
 #[test]
 fn covariance_with_equal_diagonal_has_correct_axes() {
     for direction in [[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, -1.0]] {
@@ -193,7 +198,8 @@ fn covariance_with_equal_diagonal_has_correct_axes() {
     }
 }
 
-/// Case 24 of the table in `main.rs`: a zero quaternion merges like the identity with the same scales, and is counted.
+/// A Gaussian with a zero quaternion merges like one with the identity as rotation, and is counted in the summary (case
+/// 24 of the table in `main.rs`).
 #[test]
 fn zero_quaternion_is_the_identity_and_flagged() {
     let score = |turn: [f32; 4]| {
@@ -225,8 +231,8 @@ fn zero_quaternion_is_the_identity_and_flagged() {
     }
 }
 
-/// Case 20 of the table in `main.rs`: two balls half a standard deviation apart merge, and two balls three apart do
-/// not, at any size.
+/// Two balls half a standard deviation apart merge, from a size of 1e-12 to 1e6 (case 20 of the table in `main.rs`).
+/// Small balls three standard deviations apart do not merge.
 #[test]
 fn merging_distance_scales_with_size_from_1e_minus_12_to_1e6() {
     for size in [1e-12, 1e-9, 1e-6, 1e-3, 1e3, 1e6f64] {
@@ -250,8 +256,8 @@ fn merging_distance_scales_with_size_from_1e_minus_12_to_1e6() {
     }
 }
 
-/// Cases 20 and 27 of the table in `main.rs`: sizes from points to the whole sky, in front of, around and behind the
-/// camera.
+/// Gaussians from points to the size of the sky, in front of, around and behind the camera, give finite results (cases
+/// 20 and 27 of the table in `main.rs`).
 #[test]
 fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
     let workplace = Workplace::new();
@@ -290,7 +296,8 @@ fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
     }
 }
 
-/// Cases 29 and 30 of the table in `main.rs`.
+/// Gaussians behind a wall are pruned first (case 29 of the table in `main.rs`), and a giant Gaussian in the background
+/// merges with no other (case 30).
 #[test]
 fn hidden_go_first_and_giant_background_merges_with_none() {
     let workplace = Workplace::new();
@@ -337,8 +344,9 @@ fn hidden_go_first_and_giant_background_merges_with_none() {
     }
 }
 
-/// Case 32 of the table in `main.rs`. For ten million points see `ten_million_points_in_one_voxel_cost_bounded_time`,
-/// which runs only by name.
+/// If Gaussians have more neighbors than the search returns, only the nearest are compared, and the summary counts
+/// these Gaussians (case 32 of the table in `main.rs`). For ten million points see
+/// `ten_million_points_in_one_voxel_cost_bounded_time`, which runs only by name.
 #[test]
 fn crowded_voxel_is_truncated_and_noted() {
     const N: usize = 30_000;
@@ -356,8 +364,8 @@ fn crowded_voxel_is_truncated_and_noted() {
     assert!(pass["candidates"].as_u64().unwrap() <= 32 * N as u64 && pass["joins"].as_u64().unwrap() > 0, "{pass}");
 }
 
-/// Case 33 of the table in `main.rs`: balls along a line, ordered by size, in which each ball is the leader of the next
-/// one.
+/// Balls along a line, sorted by contribution, merge in pairs (case 33 of the table in `main.rs`): each ball could be
+/// the leader of the next one, so the sequential rule decides.
 #[test]
 fn sorted_chain_merges_by_the_sequential_rule() {
     const N: usize = 4000;
@@ -386,8 +394,8 @@ fn sorted_chain_merges_by_the_sequential_rule() {
     assert_eq!(summary["merge"]["passes"][0]["sequential"], true, "{}", summary["merge"]);
 }
 
-/// Case 36 of the table in `main.rs`: behind the camera C and Vis are 0. The weights are opacity × area, and equal if
-/// those are 0 too.
+/// Gaussians behind the camera, whose C and Vis are 0, merge with the weights opacity × area (case 36 of the table in
+/// `main.rs`). The weights are equal if these are 0 too.
 #[test]
 fn unseen_gaussians_merge_by_opacity_times_area() {
     for (logits, weight) in [([2.0f32, -1.0], None), ([-200.0, -200.0], Some(0.5))] {

@@ -8,7 +8,8 @@ use super::{Rows, Sequence, assert_close};
 
 const ALIVE: f32 = 0.0;
 const DEAD: f32 = -7.0;
-/// Options for each of the two definitions of motion. Noise removal is off, because these scenes have no noise.
+/// Options of `score` for the two definitions of motion, without the removal of rounding noise, because the positions
+/// here have none.
 const RUNS: &str = "--preset default --set snap_noise=false";
 const LITERAL: &str = "--preset paper --set snap_noise=false";
 
@@ -34,7 +35,8 @@ fn statistic(rows: &Rows, name: &str, i: usize) -> f64 {
     rows[name][i]
 }
 
-/// Case 4 of the table in `main.rs`.
+/// A sequence of two frames (case 4 of the table in `main.rs`) has one step, and no curvature and no variance of
+/// opacity.
 #[test]
 fn two_frames_have_one_step_and_no_curvature() {
     let rows = move_along_x(30, 2, RUNS, |i, t| (i * t) as f64 * 0.25, |_, _| ALIVE);
@@ -47,9 +49,13 @@ fn two_frames_have_one_step_and_no_curvature() {
     }
 }
 
-/// Case 5 of the table in `main.rs`, for a range of periods and phases. D holds to a relative error of 1e-6, and κ to
-/// 1e-6 of the amplitude: rounding positions to f32 leaves that error in second differences of 4e-5. Against the second
-/// differences of the rounded positions κ holds to a relative error of 1e-6.
+/// Positions that follow sinusoids over 100,000 frames have the motion D and the curvature κ that formulas give (case 5
+/// of the table in `main.rs`), for a range of periods and phases.
+///
+/// - D has a relative error of at most 1e-6.
+/// - κ has an error of at most 1e-6 of the amplitude. Rounding positions to f32 causes this error; the second
+///   differences themselves may be as small as 4e-5.
+/// - Compared with the second differences of the rounded positions, κ has a relative error of at most 1e-6.
 #[test]
 #[ignore = "needs time"]
 fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
@@ -76,7 +82,8 @@ fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
     }
 }
 
-/// Case 11 of the table in `main.rs`, for opacities up to the largest f32 below 1, stored once and in every frame.
+/// A constant opacity has a variance of exactly 0 over 100,000 frames (case 11 of the table in `main.rs`): for
+/// opacities up to the largest f32 below 1, stored once or in every frame.
 #[test]
 #[ignore = "needs time"]
 fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
@@ -91,7 +98,8 @@ fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
     }
 }
 
-/// Case 12 of the table in `main.rs`, for a range of distances.
+/// A Gaussian that jumps while it is not alive has the same motion as without the jump (case 12 of the table in
+/// `main.rs`), for a range of distances.
 #[test]
 fn teleport_while_dead_changes_no_motion() {
     let distance = |i: usize| 2f64.powi(i as i32 - 10);
@@ -111,7 +119,8 @@ fn teleport_while_dead_changes_no_motion() {
     }
 }
 
-/// Case 13 of the table in `main.rs`, for a range of distances; `merging.rs` checks that the pair never merges.
+/// A jump of a Gaussian while it is alive counts as motion (case 13 of the table in `main.rs`), for a range of
+/// distances. `merging.rs` checks that a Gaussian that jumps does not merge with one that rests.
 #[test]
 fn teleport_while_alive_is_motion() {
     let distance = |i: usize| 2f64.powi(i as i32 - 10);
@@ -122,7 +131,8 @@ fn teleport_while_alive_is_motion() {
     }
 }
 
-/// Case 14 of the table in `main.rs`, for every first frame of the life.
+/// Gaussians that are alive for 1, 2 and 3 frames have 0, 0 and 1 terms of curvature (case 14 of the table in
+/// `main.rs`), for every first frame.
 #[test]
 fn lives_of_1_2_3_frames_have_0_0_1_curvature_terms() {
     // Gaussian 3·b + l − 1 is alive for l frames from frame b on.
@@ -137,7 +147,8 @@ fn lives_of_1_2_3_frames_have_0_0_1_curvature_terms() {
     }
 }
 
-/// Case 15 of the table in `main.rs`, for every pattern without two adjacent alive frames.
+/// Gaussians that are never alive in two consecutive frames have no motion and no curvature (case 15 of the table in
+/// `main.rs`).
 #[test]
 fn alternating_lives_have_no_interior_triples() {
     let life = |i: usize, t: usize| if t % (2 + i / 2) == i % 2 { ALIVE } else { DEAD };
@@ -148,7 +159,8 @@ fn alternating_lives_have_no_interior_triples() {
     }
 }
 
-/// Case 16 of the table in `main.rs`, for death at any frame, also at the end of the sequence.
+/// A jump after the last frame in which a Gaussian is alive does not count as curvature (case 16 of the table in
+/// `main.rs`), whichever frame is the last.
 #[test]
 fn curvature_at_the_last_alive_frame_is_discarded() {
     // Straight until death, then far away: only a second difference centered on the last alive frame would see the
@@ -162,7 +174,7 @@ fn curvature_at_the_last_alive_frame_is_discarded() {
     }
 }
 
-/// Case 19 of the table in `main.rs`: subnormal numbers are values like any other.
+/// Subnormal coordinates count as motion like any other values, and −0 counts as 0 (case 19 of the table in `main.rs`).
 #[test]
 fn subnormals_move_as_values_and_minus_0_is_0() {
     let step = |i: usize| f64::from(f32::from_bits(1)) * (i + 1) as f64;
@@ -184,8 +196,8 @@ fn subnormals_move_as_values_and_minus_0_is_0() {
     assert!(plus == minus, "the sign of 0 shows");
 }
 
-/// Case 25 of the table in `main.rs`, for a range of offsets: resting Gaussians whose floats jitter have no motion and
-/// are counted; moving Gaussians have the motion of their rounded positions.
+/// Far from the origin (case 25 of the table in `main.rs`), Gaussians that rest except for rounding noise have no
+/// motion, and the summary counts them. Gaussians that move have the motion of their rounded positions.
 #[test]
 fn far_from_the_origin_float_noise_is_snapped_and_counted() {
     const RESTING: usize = 30;

@@ -38,7 +38,8 @@ fn refused(bytes: &[u8], parts: &[&str]) {
     }
 }
 
-/// Case 41 of the table in `main.rs`.
+/// A time stamp that is not above the one before, or not finite, is refused (case 41 of the table in `main.rs`); the
+/// message names the frame.
 #[test]
 fn nonincreasing_time_stamps_are_named() {
     for (stamp, expected) in [
@@ -55,7 +56,8 @@ fn nonincreasing_time_stamps_are_named() {
     }
 }
 
-/// Case 43 of the table in `main.rs`.
+/// A frame with another number of Gaussians, other attributes or another index than expected is refused (case 43 of the
+/// table in `main.rs`); the message names the frame.
 #[test]
 fn frames_of_another_size_or_attributes_are_named() {
     // (length that frame 3 claims, number of Gaussians that the message computes from it)

@@ -152,7 +152,8 @@ fn text_ply(folder: &Folder, name: &str, rows: u64) {
     }
 }
 
-/// Returns the header of a frame stream (format/STREAM.md).
+/// Returns the header of a frame stream (format/STREAM.md) of the version `version` with `gaussians` Gaussians. The
+/// bits of `columns` are the attributes that vary with time.
 fn stream_header(version: u32, gaussians: u64, columns: u32) -> Vec<u8> {
     let mut out = b"\x89GSTR\r\n\x1a".to_vec();
     out.extend([version, 0].map(u32::to_le_bytes).concat());

@@ -440,7 +440,8 @@ fn slow_a_fifo_without_a_reader_is_an_error() {
     assert_eq!(outputs(&folder), ["fifo.ply"]);
 }
 
-/// Extension of commands that lets a test start other programs as the same user as the program under test.
+/// Method for commands that applies `user`, a function that sets the user of a command. Tests use it to start other
+/// programs as the same user as the program under test.
 trait WithUser {
     fn with_user(&mut self, user: impl Fn(&mut Command)) -> &mut Command;
 }
@@ -457,8 +458,8 @@ const PARALLEL_RUNS: usize = 3;
 /// Names of outputs that share a folder: three files with their companions, and a folder.
 const SHARED: [&str; 4] = ["a.ply", "b.ply", "c.ply", "d"];
 
-/// Prepares the folder of the stress test: links and folders whose names look like leftovers of the program, and
-/// foreign files beside and in outputs. Returns the names of the former.
+/// Prepares the folder of the stress test. Writes links and folders whose names look like leftovers of the program, and
+/// foreign files beside and in outputs. Returns the names of these links and folders.
 fn prepare_stress(folder: &Folder) -> Vec<&'static str> {
     folder.write("victim/thesis", "years of work");
     folder.write("victim/lock", LOCK_LINE);

@@ -41,7 +41,8 @@ fn pixels(page: &mut Browser) -> (u32, u32, Vec<u8>) {
     (number("width"), number("height"), STANDARD.decode(found["rgb"].as_str().unwrap()).unwrap())
 }
 
-/// Returns the PSNR of the page's image of view `view` at frame `frame` against the render of the rasterizer, dB.
+/// Returns the PSNR in dB of the page's image of the model `show` (`original` or `compressed`) in view `view` at frame
+/// `frame`. It is compared with a render of `scene`, this model, by the rasterizer.
 fn decibels(page: &mut Browser, scene: &Scene, show: &str, view: u32, frame: usize) -> f64 {
     go(page, &format!("show={show}&camera={view}&frame={frame}&paused&exact"));
     let (width, height, found) = pixels(page);

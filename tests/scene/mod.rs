@@ -40,8 +40,8 @@ pub(crate) fn piped(command: &mut process::Command, write: impl FnOnce(ChildStdi
     output
 }
 
-/// Runs `check_model_folder.py` with `python3`, or with the Python that `PYTHON` names. Returns whether it accepts the
-/// folder, and its output.
+/// Runs the script `check_model_folder.py` on a compressed model folder and its original, with `python3` or with the
+/// Python that `PYTHON` names. Returns whether the script accepts the folder, and its output.
 pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> (bool, String) {
     let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/check_model_folder.py");
@@ -163,7 +163,7 @@ impl Workplace {
         command
     }
 
-    /// Runs the program with `stdin` on its standard input.
+    /// Runs the program in this folder with the arguments `arguments` and the bytes `stdin` on its standard input.
     pub(crate) fn piped(&self, arguments: &str, stdin: &[u8]) -> Output {
         let bytes = stdin.to_owned();
         // Writing fails if the program stops reading early; the rest is dropped.

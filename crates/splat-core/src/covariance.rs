@@ -22,10 +22,10 @@ const MAX_SWEEPS: usize = 12;
 /// - Each axis points in the direction of the corresponding axis of `like`. If the three axes would then form a
 ///   reflection, the one furthest from its corresponding axis is reversed.
 /// - Of the two quaternions of R, the one nearer to `like` is returned.
-/// - If eigenvalues coincide, the axes of `like` are taken if they are valid.
+/// - If eigenvalues coincide, eigenvectors are not unique. The axes of `like` are then taken if they are eigenvectors.
 ///
-/// The result depends only on `sigma` and `like`, so a Gaussian always gets the same scales and rotation at the same
-/// time.
+/// The result depends only on `sigma` and `like`, not on earlier calls. A Gaussian thus has the same scales and
+/// rotation at a given time, in whatever order times are read.
 ///
 /// Method: Jacobi iteration in f64, started at the axes of `like`. The result reproduces Σ to about 1e-15 of its
 /// largest entry. Eigenvalues below 1e-14, such as those that rounding made negative, are raised to 1e-14. An entry of
@@ -63,7 +63,8 @@ pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
     (best.0.map(|axis| values[axis].max(MIN_EIGENVALUE).sqrt()), [rotation.w, rotation.x, rotation.y, rotation.z])
 }
 
-/// Computes the eigenvalues and unit eigenvectors of the symmetric matrix `a` by Jacobi iteration.
+/// Computes the eigenvalues of the symmetric matrix `a`, in no particular order, and the unit eigenvector of each, by
+/// Jacobi iteration.
 fn eigen(mut a: [[f64; 3]; 3]) -> ([f64; 3], [DVec3; 3]) {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let scale = a.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));

@@ -152,7 +152,8 @@ fn advice(source: &io::Error) -> &'static str {
 }
 
 impl Error {
-    /// Creates the error of a malformed input file. The arguments are the fields of [`InputError`].
+    /// Creates the error of a malformed input file, without advice to the user ([`Error::hint`] adds it). The arguments
+    /// are the fields of [`InputError`] with the same names.
     pub fn input(path: &Path, place: impl Into<String>, expected: impl Into<String>, found: impl Into<String>) -> Self {
         Error::Input(Box::new(InputError {
             path: path.to_owned(),

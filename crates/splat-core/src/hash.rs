@@ -1,8 +1,8 @@
 //! Fixed hash of Gaussian ids. Ties between Gaussians are broken by this hash, so that their order in the file has no
 //! influence. The hash is also used in place of random numbers.
 
-/// Returns a hash of `id`: the SplitMix64 finalizer (Steele, Lea and Flood 2014), applied to `id + 1` times the
-/// constant of that generator (the golden gamma).
+/// Returns a hash of `id`: output number `id` (from 0) of the generator SplitMix64 (Steele, Lea and Flood 2014) with
+/// seed 0.
 ///
 /// The hash is a bijection on u64, so two ids never tie. It is the same on every machine and in every version.
 pub fn hash_id(id: u64) -> u64 {

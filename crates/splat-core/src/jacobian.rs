@@ -2,9 +2,8 @@
 
 use super::{AttributeValues, Attributes, Gaussians, Gradients};
 
-/// Derivatives ∂state/∂stored of N Gaussians at one frame, where the state is the attributes at that frame, and stored
-/// are the attributes in the model file. Each attribute of the state depends only on the stored values of the same
-/// attribute.
+/// Derivatives ∂state/∂stored of N Gaussians at one frame. "State" means the attributes at this frame, "stored" the
+/// attributes in the model file. Each attribute of the state depends only on the stored values of the same attribute.
 ///
 /// The derivative of an attribute of w components has one of three forms, by its number of planes:
 ///
@@ -141,7 +140,8 @@ impl Jacobian {
 mod tests {
     use super::*;
 
-    /// Fills `column` with noise: a low-discrepancy sequence in [−0.5, 0.5) whose terms differ by `step` (modulo 1).
+    /// Fills `column` with noise: a low-discrepancy sequence in [−0.5, 0.5) in which each term exceeds the previous one
+    /// by `step` (modulo 1).
     fn fill_with_noise(column: &mut AttributeValues, step: f32) {
         column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract() - 0.5);
     }

@@ -57,7 +57,8 @@ pub fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// Magnitude of the finite logit that replaces an infinite one. Its opacity, 1 / (1 + e^∓100), is 1 or at most 4e-44.
+/// Magnitude of the finite logit that replaces an infinite one. The logit 100 gives an opacity of 1 in f64, and the
+/// logit −100 an opacity below 4e-44.
 pub const INFINITE_LOGIT: f32 = 100.0;
 
 /// Returns `logit` with an infinite value replaced by ±[`INFINITE_LOGIT`]; NaN and finite values are unchanged.
@@ -87,7 +88,7 @@ pub const MAX_SH_DEGREE: usize = 3;
 /// Value for a maximum SH degree that means "no limit": all SH coefficients are kept.
 pub const NO_SH_LIMIT: usize = usize::MAX;
 
-/// Properties of a sequence that are known before any frame is read.
+/// Properties of a sequence of frames, each with the same Gaussians, that are known before any frame is read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SequenceInfo {
     /// Number of Gaussians N, the same in every frame.

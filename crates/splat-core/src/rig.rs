@@ -58,14 +58,14 @@ impl Rig {
     /// the camera file is read.
     pub const BYTES_PER_CAMERA: u64 = 2 * size_of::<Camera>() as u64 + 16;
 
-    /// Bytes of memory per view, except its camera and the text of its file name. This is the sum of:
+    /// Bytes of memory per view, except its camera and the path of its photograph. This is the sum of:
     /// - a [`Shot`];
     /// - 32 bytes for entries in two tables while the camera file is read;
     /// - 3 × 40 bytes for an entry in a [`ViewSchedule`], because a vector that grows needs its old memory and twice as
     ///   much new memory.
     pub const BYTES_PER_VIEW: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
 
-    /// Bytes of memory per file name in addition to its text: the overhead of the allocator.
+    /// Bytes of memory per path of a photograph, in addition to its text: the overhead of the allocator.
     pub const NAME_OVERHEAD_BYTES: u64 = 32;
 
     /// Returns the bytes of memory that all cameras and views take, including one [`ViewSchedule`] of them.
@@ -139,11 +139,11 @@ impl Rig {
         Ok(schedule)
     }
 
-    /// Returns the index of the frame that `shot` belongs to by the rule of [`Rig::schedule`]. Returns `None` if the
-    /// view belongs to every frame.
+    /// Returns the index of the frame whose time is nearest to the time of the view `shot`. Returns `None` if the view
+    /// has no time, and so belongs to every frame. `frame_times` are the increasing times of the frames.
     ///
     /// # Errors
-    /// Fails with [`Error::Usage`] if no frame has the time of the view.
+    /// Fails with [`Error::Usage`] if the two times differ by more than the tolerance of [`Rig::schedule`].
     pub fn frame_of(&self, shot: &Shot, frame_times: &[f64]) -> Result<Option<usize>> {
         let Some(time) = shot.time else { return Ok(None) };
         let tolerance = TIME_TOLERANCE * if frame_times.len() > 1 { span(frame_times) } else { 1.0 };

@@ -112,7 +112,7 @@ impl ViewSchedule {
         &self.views[self.runs[run].view..end]
     }
 
-    /// Returns the number of frames of the run `run`.
+    /// Returns the number of frames of the run with the index `run` (consecutive frames with equal views).
     fn run_length(&self, run: usize) -> usize {
         self.runs.get(run + 1).map_or(self.frames, |next| next.frame) - self.runs[run].frame
     }

@@ -339,7 +339,8 @@ pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features
 }
 
 /// Evaluates the layers of the trunk (the MLP shared by all attributes) for `input`. Returns the output of the last
-/// layer after ReLU, which every head (MLP of one attribute) reads.
+/// layer after ReLU, which every head (MLP of one attribute) reads. `last` and `spare` are buffers for the outputs of
+/// the layers; the returned slice is the content of `last`.
 #[inline(always)]
 fn run_trunk<'a, const FMA: bool>(
     layers: &[Linear],

@@ -84,12 +84,12 @@ impl Linear {
         }
     }
 
-    /// Computes into `out` the derivatives of a value with respect to the inputs of the layer, from its derivatives
-    /// with respect to the outputs (`output_gradient`). Both arrays are filled up with zeros to whole panels ([`PANEL`]
-    /// values).
+    /// Computes the backward pass of the layer: converts derivatives of a value with respect to the outputs
+    /// (`output_gradient`) to derivatives with respect to the inputs (`out`). Both arrays are padded with zeros to a
+    /// multiple of [`PANEL`] entries.
     ///
-    /// `activations` are the inputs of the layer, if they come out of a ReLU: the derivative of an input that is not
-    /// positive becomes 0. `None` if they do not come out of a ReLU.
+    /// `activations` holds the inputs of the layer if they come out of a ReLU, and is `None` if not. With it, the
+    /// derivative is continued through the ReLU: it becomes 0 for an input that is not positive.
     #[inline(always)]
     pub(super) fn backward<const FMA: bool>(
         &self,

@@ -302,8 +302,9 @@ impl Network {
         self.differentiate::<true>(encoded, time, out);
     }
 
-    /// Computes the motion of the attributes `want` into `out`. The compiler inlines this function and its callees into
-    /// one copy per instruction set; `FMA` says whether fused multiply-adds are used.
+    /// Computes the motion of the attributes `want` at `time` into `out`, from the encoded positions `encoded`. The
+    /// compiler inlines this function and its callees into one copy per instruction set; `FMA` says whether fused
+    /// multiply-adds are used.
     #[inline(always)]
     fn evaluate<const FMA: bool>(
         &self,

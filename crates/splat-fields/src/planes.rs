@@ -155,11 +155,11 @@ pub fn texel_pair(u: f32, size: usize) -> TexelPair {
     TexelPair { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
-/// Returns the number of rows at the start of a feature plane that are not read at any time ≥ 0, so that they need not
-/// be stored. Returns 0 for tensors that are not planes over an axis and time.
+/// Returns how many rows at the start of a feature plane are not read at any time ≥ 0, so that they need not be stored.
+/// A row holds the features at one time. Returns 0 for tensors that are not planes over an axis of space and time.
 ///
-/// `name` and `shape` are the name and the shape of the tensor of the plane; the third extent is the number of rows.
-/// Rows span the times −1 to 1, but models use times from 0 on, so about half of each plane is never read.
+/// `name` is the name of the tensor that holds the plane, and `shape` its shape; `shape[2]` is the number of rows. The
+/// rows cover the times −1 to 1, but models use times from 0 on, so about half of the rows are never read.
 pub fn count_unread_time_rows(name: &str, shape: &[usize]) -> usize {
     let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
     match (place, shape) {

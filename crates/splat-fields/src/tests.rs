@@ -25,7 +25,7 @@ fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gauss
     (state, deltas)
 }
 
-/// Builds a deformation field with random weights and `depth` layers in its trunk.
+/// Builds a deformation field with random weights and `depth` layers in its trunk (the MLP shared by all attributes).
 fn build(config: &FieldConfig, depth: usize) -> Field {
     Field::new(&random_tensors(config, depth), config.clone(), 3, Path::new("synthetic.pth")).unwrap()
 }
@@ -35,8 +35,8 @@ fn values(column: &AttributeValues, i: usize) -> Vec<f64> {
     (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect()
 }
 
-/// Asserts that the attributes that a field computes for random Gaussians match the f64 reference (oracle). `what`
-/// names the tested case in failures.
+/// Asserts that the attributes that a field computes for random Gaussians match the f64 reference (oracle). The field
+/// has the options `config` and `depth` layers in its trunk. `what` names the tested case in failures.
 fn assert_matches_oracle(what: &str, config: FieldConfig, depth: usize) {
     let tensors = random_tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
@@ -313,7 +313,8 @@ fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients)
 }
 
 /// Asserts, for each of the attributes `columns`, that derivatives with respect to its stored values match finite
-/// differences of the f64 reference (oracle). `what` names the tested case in failures.
+/// differences of the f64 reference (oracle). The field has the options `config` and `depth` layers in its trunk.
+/// `what` names the tested case in failures.
 fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize, columns: Attributes) {
     let tensors = random_tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };

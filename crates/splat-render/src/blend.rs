@@ -34,8 +34,8 @@ pub(super) struct SampledPixels {
     xs: TileLine,
     /// Offset of each row of the tile from its first row, in pixels of the image.
     ys: TileLine,
-    /// For the left and the right half of the tile, the offsets of its first and of its last column from the first
-    /// column of the tile, in pixels of the image. Each half has up to eight columns of the render.
+    /// First and last column of the left half of the tile, then of the right half, as offsets from the first column of
+    /// the tile in pixels of the image. Each half has up to eight columns of the render.
     spans: [[f32; 2]; SIDE / LANES],
     /// Number of columns of the tile that belong to the render.
     across: usize,
@@ -339,8 +339,8 @@ impl TileFootprint {
         footprint
     }
 
-    /// Removes the pixels outside the tiles in which the original CUDA rasterizer draws the splat
-    /// ([`Splat::drawn_tiles`]) from the footprint.
+    /// Removes from the footprint all pixels outside the tiles in which the original CUDA rasterizer draws the splat
+    /// ([`Splat::drawn_tiles`]).
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));

@@ -136,8 +136,8 @@ impl Renderer {
         self.render_prepared(&view, background)
     }
 
-    /// Blends the splats that [`Renderer::prepare`] has projected and sorted, and returns the image. `view` must be the
-    /// view of that call.
+    /// Blends the splats that [`Renderer::prepare`] has projected and sorted over the color `background`, and returns
+    /// the image. `view` must be the view for which `prepare` was called.
     pub(super) fn render_prepared(&mut self, view: &CameraTerms, background: [f32; 3]) -> Image {
         let [width, height] = view.size;
         let row_len = width as usize * 3;
@@ -203,8 +203,9 @@ impl Renderer {
         }
     }
 
-    /// Adds the removal error of each Gaussian in `view` (the squared error of a render without this Gaussian) to
-    /// `errors`. Errors are sums over the pixels of the grid of `view`. Tiles are blended on the calling thread only.
+    /// Adds the removal error of each Gaussian in `view` to `errors`: the squared error of a render over the color
+    /// `background` without this Gaussian. Errors are sums over the pixels of the grid of `view`. Tiles are blended on
+    /// the calling thread only.
     ///
     /// # Panics
     /// Panics if `errors` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
@@ -295,8 +296,8 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
     }
 }
 
-/// Blends the splats of one tile and returns the colors of its sampled pixels, one plane per channel. `pairs` holds the
-/// indices in `splats` of the splats of the tile, nearest first.
+/// Blends the splats of one tile over the color `background`. Returns the colors of the pixels `sampled` of the tile,
+/// one plane per channel. `pairs` holds the indices in `splats` of the splats of the tile, nearest first.
 fn blend_colors(
     blend: BlendKernel,
     splats: &[Splat],

@@ -32,8 +32,8 @@ pub(crate) fn layout(gaussians: u64, gaussian_block: u32, frame_block: u32, widt
 }
 
 impl Scene {
-    /// Builds a scene: column 0 moves, column 1 is constant in time, the others hold arbitrary bits, including NaN and
-    /// −0.
+    /// Builds a test sequence of `frames` frames. Values of column 0 change in every frame, column 1 is constant in
+    /// time, and other columns hold pseudo-random bits from `seed`, including NaN and −0.
     pub(crate) fn new(layout: Layout, frames: usize, seed: u64) -> Scene {
         let mut state = seed;
         let mut random = move || {
@@ -93,8 +93,8 @@ impl Scene {
         (out, (frames.end - frames.start) as u32, width as u32, (gaussians.end - gaussians.start) as u32)
     }
 
-    /// Sets a bound on every column but the last and writes the scene to `path`. Returns it together with the scene as
-    /// read back.
+    /// Sets the error bound `max_error` for every column but the last, and writes the scene to the container `path`.
+    /// Returns the original scene, then the scene as read back from the file.
     #[allow(dead_code, reason = "not every test has bounds")]
     pub(crate) fn bounded(mut self, max_error: f64, path: &Path) -> (Scene, Scene) {
         let columns = self.layout.columns.len();
@@ -117,8 +117,8 @@ impl Scene {
         (self, back)
     }
 
-    /// Writes the scene to the container `path`: the time stamps of each block of frames, followed by its tiles in the
-    /// order set by `shuffle`. Returns the digest of the content.
+    /// Writes the scene to the container `path`, with the tiles in the order set by `shuffle`. The time stamps of a
+    /// block of frames are written before the first of its tiles. Returns the hash of the content.
     pub(crate) fn write(&self, path: &Path, compression: Compression, shuffle: impl Fn(&mut Vec<TileId>)) -> u64 {
         let mut writer = Writer::create(path, self.layout.clone()).unwrap();
         self.fill(&mut writer, compression, shuffle);
@@ -150,8 +150,8 @@ impl Scene {
         }
     }
 
-    /// Compares the first `frames` frames of this scene with those of `reader`, read by every method of reading.
-    /// Returns errors of the reader.
+    /// Asserts that `reader` has exactly the first `frames` frames of this scene, with every method of reading. Returns
+    /// an error if reading fails.
     pub(crate) fn compare(&self, reader: &Reader, frames: usize) -> gseq::Result<()> {
         assert_eq!(*reader.layout(), self.layout);
         assert_eq!(reader.times(), &self.times[..frames]);

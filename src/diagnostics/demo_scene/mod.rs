@@ -3,9 +3,9 @@
 //! The test scene is a room. It has one [`DemoBody`] for each property of trained scenes that the program handles:
 //! needless Gaussians, rigid and non-rigid motion, fading and flashing, thin structures. The motion of each Gaussian is
 //! a closed formula of the time. In both scenes, every value is a function of the id of the Gaussian, the number of
-//! Gaussians and the time. So nothing is stored, and any block of Gaussians can be read on its own.
+//! Gaussians and the time. So nothing is stored, and any Gaussian can be read without the others.
 //!
-//! Memory: at most 192 bytes per Gaussian of a block that is open for reading.
+//! Memory: at most 192 bytes per Gaussian that an open reader covers.
 
 mod bodies;
 mod motion;

@@ -33,8 +33,8 @@ pub(super) enum DemoMotion {
     /// Motion of the Gaussians of the egg, which runs along three quarters of an ellipse and spins once. `position` and
     /// `rotation` of the Gaussian are relative to the egg.
     Egg,
-    /// Displacement along y by a wave that runs through a cloth or flag. `along` is the place of the Gaussian on the
-    /// cloth: 0 at the edge where it is held, 1 at its free edge.
+    /// Displacement along y by a wave that runs through a cloth or flag. `along` is the position of the Gaussian across
+    /// the cloth: 0 at the edge where it is held, 1 at its free edge.
     Wave { along: f64 },
     /// No motion, but a linear change of the opacity logit, by `rate` per unit of time.
     Fade { rate: f64 },

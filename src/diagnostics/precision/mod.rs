@@ -9,8 +9,9 @@
 //!   limit must not change any result.
 //! - *Model*: fewer Gaussians, which may be merged or refined, replace those of the model.
 //!
-//! Memory: that of `compress`, that of the open scene, [`HELD_BYTES`] bytes per Gaussian, and 12 bytes for every pixel
-//! of the views on which quality is measured. Complete runs of the program get the rest of the memory limit.
+//! Memory: the memory of `compress`, the memory of the open scene, [`HELD_BYTES`] bytes per Gaussian, and 12 bytes for
+//! every pixel of the views on which quality is measured. Complete runs of the program may use the memory that remains
+//! within the limit.
 
 mod judge;
 mod ranking;
@@ -84,8 +85,8 @@ impl Knob {
         }
     }
 
-    /// Returns the reason, as text for the user, for which this knob (parameter that `precision` varies) could not be
-    /// measured: something that it needs and the scene or the recipe lacks. There is one possible reason per knob.
+    /// Returns a text for the user that says why this knob (parameter that `precision` varies) could not be measured:
+    /// what the scene or the recipe lacks. Each knob has only one possible reason.
     fn needs(self) -> &'static str {
         match self {
             Knob::Sums => "sums over frames need three frames",

@@ -113,7 +113,8 @@ impl Bench<'_> {
         measure.visible.as_ref().map(inspect).transpose()
     }
 
-    /// Returns the result of [`Bench::contributions`] for `recipe`, and the time and memory of computing it.
+    /// Returns the contributions of all Gaussians, as [`Bench::contributions`] does, and the time and memory of
+    /// computing them.
     fn contributions_with_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
         self.repeats.measure_cost(|| self.contributions(recipe), || Ok(()))
     }
@@ -200,9 +201,9 @@ impl Bench<'_> {
     }
 
     /// Ranks the Gaussians in pruning rounds with the parameters `select`, starting from the scores `scored`. Returns
-    /// the ids of the kept Gaussians and the cost (time and memory), without errors. `value`: value of the varied
-    /// parameter in `select`. `step`: step size h of this value, its coarseness; an error of order p is proportional to
-    /// h^p.
+    /// the ids of the kept Gaussians and the cost (time and memory); the list of errors is empty. `value`: value of the
+    /// varied parameter in `select`. `step`: step size h of this value, its coarseness; an error of order p is
+    /// proportional to h^p.
     fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {

@@ -171,8 +171,8 @@ impl Bench<'_> {
     }
 
     /// Compresses `input` by `recipe` in complete runs of the program. Returns the cost (time and memory), and as error
-    /// 0 if the result has the expected digest, 1 if not. `value`: value of the varied parameter. `expected`: digest of
-    /// the result of the first setting; at the call for the first setting it is `None`, and this call sets it.
+    /// 0 if the result has the digest `expected`, 1 if not. `value`: value of the varied parameter. In the call for the
+    /// first setting, `expected` is `None`; this call stores the digest of its result there.
     fn compare_bytes(
         &self,
         recipe: &Recipe,

@@ -128,9 +128,10 @@ pub(super) fn harmonics() -> CaseResult {
 }
 
 /// Compares the 20 largest gradients of each attribute with finite differences. A gradient is the derivative of half
-/// the squared error of a render. A difference is that of the same error of two f64 renders, with the parameter changed
-/// by 6e-5 between them. Errors are relative to the expected gradient; the gradients of the program are f32 sums of
-/// terms of both signs. Returns the largest error, with the bound that it must not exceed.
+/// the squared error of a render with respect to one parameter. A finite difference is computed from the errors of two
+/// f64 renders, whose values of the parameter differ by 6e-5. Errors are relative to the expected gradient; the
+/// gradients of the program are f32 sums of terms of both signs. Returns the largest error, with the bound that it must
+/// not exceed.
 pub(super) fn gradients() -> CaseResult {
     CaseResult::new("backward pass", "derivatives: differences in f64", 5e-5, || {
         let (scene, camera) = (random_gaussians(3, 40, 3), tilted_camera(33, 100));

@@ -145,8 +145,9 @@ pub(super) fn repair(target: &Path, supersedes: bool) {
     }
 }
 
-/// Locks the workspace (hidden folder) `name` in the folder `parent`, which a killed run left with an interrupted move
-/// of its result, and returns it. Returns `None` if that is not possible. The caller holds the [`PublishLock`].
+/// Locks and returns a workspace (hidden folder) that a killed run left with an interrupted move of its result. `name`
+/// is the name of the workspace in the folder `parent`. Returns `None` if the workspace cannot be locked. The caller
+/// holds the [`PublishLock`].
 ///
 /// Another run may hold the lock of this workspace: the run that created it and is about to end after a failure, or a
 /// run that inspects it for a moment. So this function tries for up to 5 s ([`MAX_INSPECTION_WAIT`]).
@@ -209,9 +210,10 @@ pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, t
     Ok(())
 }
 
-/// Moves the files of the journal (list of the files of one result that get their final names together) that are still
-/// in the workspace `folder` to their final names in the folder `parent`. Skips names that do not begin with the name
-/// of `target`. Fails if the journal cannot be read, or if a file must not be replaced or cannot be moved.
+/// Completes an interrupted move: renames the files that are still in the workspace `folder` to their final names in
+/// the folder `parent`. The journal (list of the files of one result) in the workspace states these names. Skips names
+/// that do not begin with the name of `target`. Fails if the journal cannot be read, or if a file must not be replaced
+/// or cannot be moved.
 fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
     let (_, name) = split_target(target)?;

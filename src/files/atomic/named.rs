@@ -14,9 +14,9 @@ use splat_platform::{FolderHandle, open_without_waiting};
 
 use crate::error::{Error, Result, ShowPath, quoted};
 
-/// Name of the summary file that identifies a folder as a result of this program: a JSON object whose `tool` names the
-/// program. The list `files` in it names the files of the result; [`super::StagedFolder::commit`] and
-/// [`super::StagedFiles::commit`] add them.
+/// Name of the summary file, which identifies a folder as a result of this program. The file is a JSON object. Its
+/// member `tool` names the program, and its member `files` lists the files of the result.
+/// [`super::StagedFolder::commit`] and [`super::StagedFiles::commit`] add this list.
 pub const SUMMARY_FILE: &str = "summary.json";
 
 /// Maximum size in bytes of a file that is read as a summary: 16 MiB, enough to list about 500,000 files. Larger files
@@ -161,9 +161,11 @@ fn find_foreign(
     result
 }
 
-/// Returns the path below `folder` to which a foreign entry with the relative path `relative` is moved. Nothing exists
-/// at this path: `.kept` is appended to the last component if something of this name exists, and to any other component
-/// that exists but is not a folder.
+/// Returns an unused path below `folder` for a foreign entry with the relative path `relative`. This is `relative`
+/// itself, except that `.kept` is appended to a component whose name is taken:
+///
+/// - to the last component, if a file or folder of this name exists
+/// - to any other component, if something that is not a folder has this name
 fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     let mut place = folder.to_owned();
     let mut components = relative.components().peekable();

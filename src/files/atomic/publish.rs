@@ -105,7 +105,8 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
     Ok(())
 }
 
-/// Syncs the folder entry of the output `target` to disk. A failure is only a warning, because the output is in place.
+/// Syncs the folder that holds the output `target` to disk, so that the name of the output is stored. A failure is only
+/// a warning, because the output is in place.
 fn sync_parent(target: &Path) {
     let Ok((parent, _)) = split_target(target) else { return };
     if let Err(error) = sync_folder(&parent) {

@@ -159,7 +159,7 @@ fn impossible_targets_are_refused() {
 }
 
 /// Creates the workspace (hidden folder) that a killed run leaves beside the target `base/out`: the folder and an
-/// unlocked lock file. `random` is the random part of the folder name.
+/// unlocked lock file. `random` is the random part of the folder name. Returns the path of the folder.
 fn killed_workspace(base: &Path, random: &str) -> PathBuf {
     let folder = base.join(format!(".out.{random}.splatsieve-tmp"));
     write_file(&folder.join("lock"), workspace::LOCK_LINE);
@@ -300,8 +300,8 @@ fn a_summary_lists_its_files_and_keeps_its_order() {
     assert_eq!(names_in(base.path()), ["out"]);
 }
 
-/// Writes `x.ply` and its two companions under hidden names, for publication in `base` with the policy `replace`. The
-/// output and one companion hold `text`; the other companion is a summary.
+/// Writes `x.ply` and its two companions under hidden names, and returns the handle that publishes them in `base` with
+/// the policy `replace`. The output and one companion hold `text`; the other companion is a summary.
 fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
     let companions = ["x.ply.summary.json", "x.ply.recipe.toml"].map(|name| base.join(name)).to_vec();
     let staged = StagedFiles::new(&base.join("x.ply"), companions, replace)?;
@@ -322,8 +322,9 @@ fn overwriting_a_file_replaces_it_with_its_companions() {
     assert_eq!(fs::read_to_string(base.path().join("x.ply.notes")).unwrap(), "precious");
 }
 
-/// Creates in `base` the state that a run with the policy `replace` leaves if it is killed when only `published` of its
-/// files have their final names.
+/// Creates in `base` the files that a run leaves if it is killed while it renames `x.ply` and two companions to their
+/// final names. `published` is the number of files that already have their final names, and `replace` is the policy of
+/// the run for existing files.
 fn leave_half_published(base: &Path, published: usize, replace: Replace) {
     let left = base.join(".x.ply.dead.splatsieve-tmp");
     write_file(&left.join("lock"), workspace::LOCK_LINE);

@@ -23,8 +23,8 @@ use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_
 use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
-/// Stands for the name of the output in the folder name `.NAME.RANDOM.splatsieve-tmp` of a workspace (hidden folder)
-/// that holds a scratch file. A scratch file belongs to no output, so it has no output name.
+/// Placeholder for the name of the output in the folder name `.NAME.RANDOM.splatsieve-tmp` of a workspace (hidden
+/// folder) that holds a scratch file. A scratch file belongs to no output, so it has no output name.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
 /// Ending of the names of workspaces (hidden folders in which outputs are written).
 const ENDING: &str = ".splatsieve-tmp";
@@ -243,7 +243,8 @@ pub fn remove_unfinished() -> ExitGuard {
 }
 
 /// Claims the new folder `folder` as a workspace: creates a lock file in it, locks the file and writes the line
-/// [`LOCK_LINE`]. Returns `None` if another run mistook the folder for one of a killed run and is removing it.
+/// [`LOCK_LINE`]. Returns `None` if another run took the new folder for the leftover of a killed run and is removing
+/// it.
 fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     let lost = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),

@@ -236,8 +236,8 @@ impl MemoryCounter {
     }
 }
 
-/// Returns what an error message says was found if only some images of a data set have a time: an image differs from
-/// the first image in this respect. `timed` says whether the first image has a time.
+/// Returns a text for an error message: what was found at an image, if only one of this image and the first image has a
+/// time. `timed` says whether the first image has one.
 fn time_mismatch(timed: bool) -> &'static str {
     if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }

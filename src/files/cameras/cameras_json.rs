@@ -32,9 +32,9 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Keys of an image entry in this project's format.
+/// Keys of an image entry in a `cameras.json` in this project's own format.
 const IMAGE_KEYS: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
-/// Keys of a camera entry in the 3DGS format.
+/// Keys of a camera entry in a `cameras.json` of 3DGS.
 const CAMERA_KEYS: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
 
 /// Reads the cameras of `file`, a `cameras.json` in this project's own format. `outline` is the document without the
@@ -54,7 +54,8 @@ pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimi
     assembly.finish(background, shown_name(file))
 }
 
-/// Builds an image from its entry `own` in this project's format.
+/// Builds a list entry of one image (camera, time, split, path) from `own`, the JSON object of this image in a
+/// `cameras.json` in this project's own format.
 fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let (rotation, translation) = own.pose("w2c")?;
     let split = match own.optional_text("split")? {

@@ -87,6 +87,7 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
 }
 
 /// Reads the rows of the array in `file`. Checks that the array has the shape `[V, 17]`, holds floats and is complete.
+/// `counter` limits the memory.
 fn read_rows(file: &Path, counter: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH]>> {
     let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
     let mut opened = open_file(file)?;

@@ -19,7 +19,7 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Names of the files of a data set, and the split that each file lists.
+/// Names of the two camera files of a data set, and the split whose images each file lists.
 const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
 
 /// Keys whose values are lists of lists: one list per frame, with one value per camera.
@@ -30,8 +30,8 @@ pub(super) fn is_meta_json(outline: &SmallValue) -> bool {
     ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(SmallValue::List(..))))
 }
 
-/// Reads `file`. If `with_others` is set, also reads the other one of `train_meta.json` and `test_meta.json`, if it
-/// exists beside `file`.
+/// Reads the cameras in `file`, a `train_meta.json` or `test_meta.json`. If `with_others` is true, also reads the other
+/// one of these two files if it exists beside `file`.
 ///
 /// # Errors
 /// Fails if a value is missing, has the wrong length or is not a valid camera, or if the files have different numbers

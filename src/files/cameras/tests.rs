@@ -33,8 +33,8 @@ fn load_json(name: &str, content: &Value) -> crate::error::Result<Rig> {
     load(folder(&[(name, content)]).path(), &CameraOptions::default())
 }
 
-/// Writes `content` to a file called `name`, loads it, and asserts that the error message contains every one of
-/// `parts`.
+/// Writes `content` to a camera file called `name`, reads the cameras, and asserts that this fails. The error message
+/// must contain `name` and every one of `parts`.
 fn assert_refused(name: &str, content: &Value, parts: &[&str]) {
     let message = load_json(name, content).unwrap_err().to_string();
     for part in parts.iter().chain(&[name]) {

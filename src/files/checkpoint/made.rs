@@ -21,7 +21,9 @@ pub(crate) enum PythonValue {
     Parameter(PickledTensor),
 }
 
-/// Tensor to be pickled: the storage class (type of the values), the bytes of the storage, and the view of the storage.
+/// Tensor to be pickled: its storage (block of values) with the type and the bytes of the values, and the offset, shape
+/// and strides by which the tensor selects values of the storage. `class` is the name of PyTorch's storage class, and
+/// `width` the number of bytes per value.
 #[derive(Debug, Clone)]
 pub(crate) struct PickledTensor {
     pub(crate) class: &'static str,

@@ -35,9 +35,13 @@ fn ramp(n: usize) -> Vec<f32> {
     (0..n).map(|i| i as f32 + 0.5).collect()
 }
 
-/// Returns a tuple of two dicts to be written as a checkpoint. They contain tensors with one row for each of four
-/// Gaussians (one of them is a transposed parameter, two share a storage, which is a block of values), a tensor without
-/// Gaussians, a mask, and values that are not tensors.
+/// Returns a tuple of two dicts to be written as a checkpoint. They contain:
+///
+/// - tensors with one row for each of four Gaussians; one of them is a transposed parameter, and two share a storage
+///   (block of values)
+/// - a tensor whose rows are not Gaussians (`net`)
+/// - a mask: one boolean per Gaussian
+/// - values that are not tensors
 fn model() -> PythonValue {
     let transposed = PickledTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
     let [first, second] =

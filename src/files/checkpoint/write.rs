@@ -126,8 +126,8 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
 
 impl<'a> StoragePart<'a> {
     /// Lays out the values of `tensor` in a new storage (block of tensor values): computes their shape, strides and
-    /// number. `kept` is the number of rows that are kept; if `rows` is `None`, all rows of the tensor are kept.
-    /// `offset` is the index in the new storage of the first value.
+    /// number. If `rows` is given, the tensor has one row per Gaussian, of which it keeps `kept`. If `rows` is `None`,
+    /// it keeps all of its rows. `offset` is the index in the new storage of the first value.
     fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {

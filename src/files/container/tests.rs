@@ -89,8 +89,13 @@ impl BlockReader for EncodingReader<'_> {
     }
 }
 
-/// Returns five selections of Gaussians to be read in tests: all of one tile, all of the last tile (which is shorter),
-/// some of one tile, some of two adjacent tiles, and the Gaussians `scattered` in any order.
+/// Returns five selections of Gaussians to be read in tests. A tile holds consecutive Gaussians. The selections are:
+///
+/// - all Gaussians of the first tile
+/// - all Gaussians of the last tile, which is shorter
+/// - some Gaussians of one tile
+/// - some Gaussians of two adjacent tiles
+/// - the Gaussians with the indices `scattered`, in any order
 fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
     let tile = GAUSSIAN_BLOCK;
     [
@@ -157,7 +162,7 @@ fn a_reader_keeps_no_more_than_allowed() {
 }
 
 /// Returns the number of tiles that are read in one pass over all frames, and the number of bytes that these tiles take
-/// in the file.
+/// in the file. A tile holds one attribute for a block of Gaussians and frames.
 fn all_tiles(container: &Container) -> (u64, u64) {
     let (reader, mut found) = (container.reader(), (0, 0));
     for &(column, place) in &container.places {
@@ -172,7 +177,7 @@ fn all_tiles(container: &Container) -> (u64, u64) {
     found
 }
 
-/// Reads every frame in blocks of Gaussians, as a scan does, and compares the positions with those of `source`.
+/// Reads every frame in blocks of Gaussians, as a scan does, and asserts that all positions equal those of `source`.
 fn scan(source: &EncodingSource, container: &Container) {
     (0..COUNT.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().for_each(|block| {
         let ids = Ids::Range(block * GAUSSIAN_BLOCK..COUNT.min((block + 1) * GAUSSIAN_BLOCK));

@@ -295,7 +295,8 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// Releases the pages of the raw tiles of the frame block read last, if `frame` belongs to another frame block.
+    /// Prepares for reading `frame`. If `frame` belongs to another frame block than the frame read last, releases the
+    /// memory-mapped pages of the raw (uncompressed) tiles of the earlier block.
     fn enter_frame_block(&mut self, frame: usize) {
         let frame_block = self.frame_block(frame);
         if frame_block != self.entered {
@@ -309,9 +310,11 @@ impl<'a> TileReader<'a> {
         }
     }
 
-    /// Tells the operating system, once per frame block, which tiles of the attributes `want` will be read next. Does
-    /// nothing if the reader may keep less than a frame block in memory: it then decodes each block several times, and
-    /// read-ahead would evict pages that it still needs.
+    /// Tells the operating system which tiles of the attributes `want` will be read after the frame block of `frame`,
+    /// so that it reads them ahead. Does so once per frame block; the first time, also for the block itself.
+    ///
+    /// Does nothing if the reader may keep less than a frame block in memory: it then decodes each block several times,
+    /// and read-ahead would evict pages that it still needs.
     fn announce_next_tiles(&mut self, frame: usize, want: Attributes) {
         let (source, reader) = (self.source, &self.source.reader);
         let frame_block = self.frame_block(frame);

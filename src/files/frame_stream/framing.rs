@@ -7,9 +7,9 @@ use crate::model::{Attributes, sh_coefficients};
 /// Versions of the stream format. In version 1 every frame has the same Gaussians, in version 2 every frame states
 /// their number.
 const VERSIONS: [u32; 2] = [1, 2];
-/// First bytes of the mark that precedes a frame.
+/// First bytes of the mark (fixed-size part) that precedes each frame of a stream.
 const FRAME_MAGIC: [u8; 4] = *b"FRAM";
-/// First bytes of the mark at the end of the stream.
+/// First bytes of the mark (fixed-size part) at the end of a stream.
 const END_MAGIC: [u8; 4] = *b"DONE";
 
 /// Header of a stream, before its first frame.
@@ -35,8 +35,9 @@ pub(crate) enum FrameMark {
     End(u32),
 }
 
-/// Field of a header or mark that violates the format. `offset` is the byte within the header or mark at which the
-/// field begins; `expected`, `found` and `hint` are texts for the error message.
+/// Field that violates the stream format, in the header of a stream or in a mark (fixed-size part before each frame and
+/// at the end). `offset` is the byte within the header or mark at which the field begins; `expected`, `found` and
+/// `hint` are texts for the error message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct IllegalField {
     pub(crate) offset: u64,
@@ -118,10 +119,10 @@ impl StreamHeader {
 }
 
 impl FrameMark {
-    /// Length of a mark in bytes; marks precede frames and the end of the stream.
+    /// Length in bytes of a mark: the fixed-size part of a stream before each frame and at the end.
     pub(crate) const BYTES: usize = 24;
 
-    /// Returns the bytes of the mark as stored in the stream.
+    /// Returns the bytes of this mark (before a frame or at the end) as stored in the stream.
     pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
         let (mark, index, time, length) = match self {
             FrameMark::Frame { index, time, bytes } => (FRAME_MAGIC, index, time, bytes),
@@ -135,8 +136,8 @@ impl FrameMark {
         bytes
     }
 
-    /// Decodes a mark from its stored bytes. The mark follows `frames` complete frames of a stream with the header
-    /// `header`; the last of these frames is at time `before`.
+    /// Decodes a mark (fixed-size part before a frame or at the end of the stream) from its stored bytes. The stream
+    /// has the header `header`. Before the mark it held `frames` complete frames; `before` is the time of the last one.
     ///
     /// # Errors
     /// Returns the first field that violates format/STREAM.md.

@@ -18,8 +18,8 @@ use crate::model::{AttributeValues, Attributes, Gaussians};
 pub use framing::StreamHeader;
 pub(crate) use framing::{FrameMark, IllegalField};
 
-/// Minimum number of bytes by which the buffer for received values grows. Otherwise it grows by the number of bytes
-/// received so far.
+/// Minimum number of bytes by which the buffer for received values grows. Each time, it grows by the number of bytes
+/// received so far, but at least by this number.
 const MIN_ALLOCATION_BYTES: u64 = 1 << 20;
 
 /// Frame stream of which the header and the constant attributes have been read.
@@ -199,8 +199,9 @@ impl<R: Read> CountingReader<R> {
         Ok(all)
     }
 
-    /// Returns the error for an illegal field of the header or mark that begins at byte `start` of the stream. `frame`
-    /// is the number of the frame, if the mark precedes one.
+    /// Returns the error for an illegal field of the header, or of the mark before a frame or at the end. The header or
+    /// mark begins at byte `start` of the stream. `frame` is the number of the frame that was expected at the mark;
+    /// `None` for the header.
     fn error(&self, start: u64, frame: Option<u32>, illegal: IllegalField) -> Error {
         let IllegalField { offset, expected, found, hint } = illegal;
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)

@@ -6,8 +6,8 @@ use crate::source::{FrameSource, Ids};
 const N: usize = 150;
 const T: usize = 4;
 
-/// Returns a small scene, the bytes of its frame stream, and the offset of the mark before each frame and of the end
-/// mark.
+/// Returns a small scene, the bytes of its frame stream, and the offsets of all marks (fixed-size parts): one before
+/// each frame, and the end mark.
 fn written() -> (DemoScene, Vec<u8>, Vec<usize>) {
     let scene = DemoScene::new(N, T);
     let info = scene.info();
@@ -127,8 +127,8 @@ fn truncated_streams_name_the_number_of_complete_frames() {
     }
 }
 
-/// Returns the bytes of the test stream in which `field` replaces the bytes from offset `offset` on in the mark that
-/// precedes frame `frame`.
+/// Returns the bytes of the test stream with a changed mark (fixed-size part) before frame `frame`: in the mark,
+/// `field` replaces the bytes from offset `offset` on.
 fn with_mark_bytes(frame: usize, offset: usize, field: &[u8]) -> Vec<u8> {
     let (_, mut bytes, starts) = written();
     bytes[starts[frame] + offset..][..field.len()].copy_from_slice(field);

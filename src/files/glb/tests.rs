@@ -23,7 +23,8 @@ fn parts(bytes: &[u8]) -> (Value, &[u8]) {
     (serde_json::from_slice(&bytes[20..20 + length]).unwrap(), &bytes[20 + length..])
 }
 
-/// Returns a file with the JSON text `document` and the chunk `binary`.
+/// Returns the bytes of a `.glb` file with the JSON text `document`, followed by the bytes `binary` of the binary
+/// chunk.
 fn file(document: &Value, binary: &[u8]) -> Vec<u8> {
     let mut text = document.to_string().into_bytes();
     text.resize(text.len().next_multiple_of(4), b' ');

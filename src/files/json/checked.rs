@@ -135,7 +135,7 @@ impl<R: Read> CheckedReader<R> {
     ///
     /// - If the parser has not taken all bytes before `at`, returns `Ok`. The parser gets these bytes first, because
     ///   they may contain an earlier error, and the next read fails.
-    /// - If it has, returns an I/O error at once.
+    /// - If the parser has taken all of them, returns an I/O error at once.
     fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
         self.refusal = Some(error);
         // If there are bytes before the invalid one, pass them on first: they may contain an earlier error that the
@@ -148,8 +148,8 @@ impl<R: Read> CheckedReader<R> {
 
     /// Checks the bytes of the buffer that were read but not checked yet. They must be UTF-8 text, and the strings,
     /// numbers and nesting in them must not exceed their limits. At the first invalid byte, stops and calls
-    /// [`CheckedReader::refuse`]. `is_end` says whether the file ends after these bytes. An incomplete character at the
-    /// end is an error if it does, else it stays unchecked until more bytes are read.
+    /// [`CheckedReader::refuse`]. If `is_end` is true, the file ends after these bytes, and an incomplete character at
+    /// the end is an error. If it is false, such a character stays unchecked until more bytes are read.
     fn check(&mut self, is_end: bool) -> IoResult<()> {
         let from = self.checked;
         let bad = match str::from_utf8(&self.buffer[from..self.filled]) {

@@ -64,7 +64,8 @@ impl SmallValue {
         SmallValue::Object(Object { entries: vec![(key.into(), value)], others: 0 })
     }
 
-    /// Returns the elements if this is a list whose elements were all kept; `None` for other values.
+    /// Returns the elements if this is a list of which every element is in memory; `None` for a list that was cut to
+    /// its first elements, and for other values.
     pub(crate) fn elements(&self) -> Option<&[SmallValue]> {
         match self {
             SmallValue::List(kept, total) if kept.len() == *total => Some(kept),
@@ -119,7 +120,7 @@ impl SmallValue {
         }
     }
 
-    /// Converts the value to a `serde_json` value. Lists hold only the elements that were kept.
+    /// Converts the value to a `serde_json` value. A list that was cut when it was read holds only its first elements.
     fn value(&self) -> Value {
         match self {
             SmallValue::Null => Value::Null,

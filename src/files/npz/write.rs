@@ -19,14 +19,14 @@ use crate::files::zip_output::ZipOutput;
 /// Size in bytes from which a file in a zip archive needs 64-bit lengths.
 const ZIP64_BYTES: usize = 1 << 32;
 
-/// Axis of an array whose index is the Gaussian.
+/// Axis of an array that counts the Gaussians: index i along this axis belongs to Gaussian i.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum GaussianAxis {
     /// No axis: the array has no values per Gaussian and is copied unchanged.
     None,
-    /// Axis 0.
+    /// Axis 0 counts the Gaussians.
     Axis0,
-    /// Axis 1; the index of axis 0 is the frame.
+    /// Axis 1 counts the Gaussians, and axis 0 counts the frames.
     Axis1,
 }
 

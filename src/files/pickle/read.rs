@@ -23,8 +23,8 @@ struct AllocationCounter {
 }
 
 impl AllocationCounter {
-    /// Counts `bytes` that are about to be allocated. `at` is the position in the pickle that requires them. Fails if
-    /// the memory limit would be exceeded.
+    /// Counts `bytes` bytes of memory that are about to be allocated. Fails if the memory limit would be exceeded; the
+    /// error names the byte `at` of the pickle.
     fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
         let taken = self.taken.saturating_add(bytes as u64);
         if taken > self.limit {
@@ -57,8 +57,8 @@ pub(super) struct PickleMachine<'a> {
     instructions: u32,
     allocations: AllocationCounter,
     nodes: Vec<Node>,
-    /// For each node, its nesting depth: 0 for a scalar, 1 for a container of scalars, and so on. A value is not
-    /// updated when a container inside the node grows later. So code that follows the nodes must count the depth
+    /// For each node, its nesting depth: 0 for a scalar, 1 for a container of scalars, and so on. The depth of a node
+    /// is not updated when a container inside it grows later, so code that traverses the tree must count the depth
     /// itself.
     depths: Vec<u8>,
     frames: Vec<Range<usize>>,
@@ -307,8 +307,8 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the stack index of the lowest of the top `count` values. These are values to be added to a container, so
-    /// there must be one more value, the container, below them. Fails if there is none in the innermost open container.
+    /// Returns the stack index of the lowest of the top `count` values, which an instruction adds to the container
+    /// directly below them on the stack. Fails if there is nothing below them in the innermost open container.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }

@@ -72,7 +72,8 @@ fn nesting_is_limited_for_every_instruction() {
     }
 }
 
-/// Returns pickles of about `size` bytes that would take far more memory than `size` if they were read without limits.
+/// Returns pickles of about `size` bytes, each with a name for messages. They would take far more memory than `size` if
+/// they were read without limits.
 fn bombs(size: usize) -> Vec<(&'static str, Vec<u8>)> {
     let long = [&[b'X'][..], &(size as u32 / 2).to_le_bytes(), &b"x".repeat(size / 2)].concat();
     let flood = |piece: &[u8]| piece.repeat(size / piece.len());

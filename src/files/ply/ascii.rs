@@ -151,7 +151,7 @@ impl AsciiLines<'_> {
     }
 }
 
-/// Returns the text that names `element` as a place in error messages.
+/// Returns the text by which error messages name `element`.
 fn place(element: &Element) -> String {
     format!("element {}", element.name)
 }

@@ -82,7 +82,7 @@ pub struct Ply {
     body: PlyBody,
     /// Byte range of the rows of the element `vertex` (the Gaussians) in the bytes after the header.
     rows: Range<usize>,
-    /// Offset, in the bytes after the header, at which the content ends that writers copy to output files.
+    /// End of the content that writers copy to output files, as an offset in the bytes after the header.
     end: usize,
     count: usize,
     memory: ReadLimit,
@@ -93,7 +93,7 @@ pub struct Ply {
 struct PlyBody {
     /// Memory map of the whole file; for a text file, of its converted rows in the scratch file.
     map: FileMap,
-    /// Offset in bytes, in `map`, of the first table.
+    /// Offset in bytes, in `map`, of the rows of the first element.
     start: usize,
     /// For a text file: the length of the file in bytes, and the location of its rows, which were converted to binary.
     /// `None` for a binary file.
@@ -101,12 +101,12 @@ struct PlyBody {
 }
 
 impl PlyBody {
-    /// Returns the bytes of the body in binary form.
+    /// Returns all bytes after the header, with the rows of text files in binary form.
     fn bytes(&self) -> &[u8] {
         &self.map[self.start..]
     }
 
-    /// Converts a byte range of the body to a byte range of the memory map.
+    /// Converts a byte range in [`PlyBody::bytes`] to the same range in the memory map.
     fn range(&self, range: Range<usize>) -> Range<usize> {
         self.start + range.start..self.start + range.end
     }
@@ -311,18 +311,19 @@ impl Ply {
         &self.body.bytes()[self.rows.clone()][i * self.stride..(i + 1) * self.stride]
     }
 
-    /// Returns two numbers of bytes in the binary form of the file that writers copy: the bytes between the header and
-    /// the rows of `vertex`, and the bytes after these rows.
+    /// Returns how many bytes writers copy from the file before the rows of `vertex` (the Gaussians), and how many
+    /// after them. Both count the binary form of the rows, without the header.
     pub(crate) fn bytes_around(&self) -> [usize; 2] {
         [self.rows.start, self.end - self.rows.end]
     }
 
-    /// Writes the bytes of the binary body that lie before the rows of `vertex` to `out`.
+    /// Writes the rows of the elements before `vertex` (the Gaussians) to `out`, in binary form.
     pub(crate) fn write_lead(&self, out: &mut dyn Write) -> io::Result<()> {
         self.body.map.pieces(self.body.range(0..self.rows.start), |piece| out.write_all(piece))
     }
 
-    /// Writes the bytes of the binary body that lie after the rows of `vertex` to `out`.
+    /// Writes the bytes after the rows of `vertex` (the Gaussians) to `out`: in binary form, up to the end of the
+    /// content that writers copy.
     pub(crate) fn write_tail(&self, out: &mut dyn Write) -> io::Result<()> {
         self.body.map.pieces(self.body.range(self.rows.end..self.end), |piece| out.write_all(piece))
     }

@@ -223,7 +223,7 @@ fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
 }
 
 /// Builds a codebook (table of the numbers that bytes stand for) from `entries`, 1 to 256 finite numbers in
-/// `meta.json`. `what` is the name of its member for error messages. The first entry may be `None`, because some
+/// `meta.json`. Error messages name the member `what` of `meta.json`. The first entry may be `None`, because some
 /// writers store null there. It then gets the value of the second entry.
 fn codebook(entries: &[Option<f32>], path: &Path, what: &str) -> Result<Codebook> {
     let place = || format!("meta.json, {what}, codebook");

@@ -26,8 +26,8 @@ use crate::model::{Gaussians, color_from_sh, opacity};
 /// Largest magnitude of ln s that is stored, where s is a scale in scene units. Gaussians with ln s below −20 are
 /// smaller than any pixel, those with ln s above 20 larger than any scene.
 const MAX_LOG_SCALE: f32 = 20.0;
-/// Minimum of the limit on palette entries (see [`palette_entries`]): the limit for files with fewer than 2048
-/// Gaussians.
+/// Maximum number of palette entries of a file with fewer than 2048 Gaussians. Larger files may have more (see
+/// [`palette_entries`]).
 const LEAST_PALETTE: usize = 1024;
 
 /// Errors of a written file: differences between the Gaussians and the values in the file.
@@ -70,7 +70,7 @@ pub fn write_sog(state: &Gaussians, path: &Path) -> Result<SogErrors> {
     Ok(errors)
 }
 
-/// Writes the archive `path` with the files `images` and the description `meta` of them.
+/// Writes the archive `path` with the files `images`, and with `meta`, which describes them, as its `meta.json`.
 ///
 /// # Errors
 /// Fails if an image is too large or writing fails.

@@ -114,7 +114,8 @@ pub fn default_cameras(positions: &AttributeValues) -> Value {
         .map_or(json!([]), |camera| json!([self::camera_json(camera)]))
 }
 
-/// Writes `count` rows (Gaussians, as words) to a `.splatv` file at `path`. Viewers begin at the first of `cameras`.
+/// Writes a `.splatv` file to `path`. `rows` yields the 32-bit words of each of the `count` Gaussians. `cameras` is a
+/// JSON list; viewers begin at its first camera.
 ///
 /// # Errors
 /// Fails if the file cannot be written.

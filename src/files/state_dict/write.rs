@@ -25,8 +25,7 @@ const ALIGNMENT: u16 = 64;
 pub(crate) struct StoredTensor {
     /// Name of the tensor; the keys of nested dicts are joined by dots.
     pub(crate) name: String,
-    /// Stored values, of which the tensor is a view: `offset` and `stride` say which of them is which element of the
-    /// tensor.
+    /// Stored values, of which the tensor is a view: `offset` and `stride` give the index in `values` of each element.
     pub(crate) values: TensorValues,
     /// Index in `values` of the first element.
     pub(crate) offset: usize,

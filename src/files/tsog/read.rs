@@ -197,9 +197,9 @@ fn is_f32(value: f64) -> bool {
     (value as f32).is_finite()
 }
 
-/// Returns the number of frames, the frame rate and the mapping of times of an archive with the content `meta` of its
-/// `meta.json`. `timeline` says when the Gaussians are visible. Players use times from 0 to 1. If `meta` states the
-/// times of the original sequence, they are mapped to these; otherwise the mapping leaves times unchanged.
+/// Returns the number of frames, the frame rate and the mapping of times of an archive. `meta` is the content of its
+/// `meta.json`, and `timeline` says when the Gaussians are visible. The mapping converts times of the original sequence
+/// to the times of players, from 0 to 1. If `meta` does not state the original times, it leaves times unchanged.
 fn clip_times(meta: &TsogMeta, timeline: Timeline, path: &Path) -> Result<ClipTimes> {
     let playback = meta.playback.as_ref();
     let number = |name: &str, value: Option<f64>| match value {

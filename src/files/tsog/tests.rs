@@ -49,7 +49,7 @@ fn path(folder: &tempfile::TempDir) -> std::path::PathBuf {
     folder.path().join("a.tsog")
 }
 
-/// Returns the content of `meta.json` and the names of all files of an archive.
+/// Returns the content of `meta.json` and the names of all files in the archive at `path`.
 fn meta(path: &Path) -> (Value, Vec<String>) {
     let mut archive = ZipArchive::new(File::open(path).unwrap()).unwrap();
     let names = archive.file_names().map(str::to_owned).collect();
@@ -57,7 +57,7 @@ fn meta(path: &Path) -> (Value, Vec<String>) {
     (serde_json::from_str(&text).unwrap(), names)
 }
 
-/// Decodes the image `name` of an archive.
+/// Decodes the image file called `name` in the archive at `path`.
 fn image(path: &Path, name: &str) -> RgbaImage {
     let mut archive = ZipArchive::new(File::open(path).unwrap()).unwrap();
     let mut bytes = Vec::new();
@@ -65,7 +65,7 @@ fn image(path: &Path, name: &str) -> RgbaImage {
     RgbaImage::from_webp(&bytes, 1 << 20).unwrap()
 }
 
-/// Writes the archive at `path` again, with the changes that `change` makes to `meta.json`, and compressed by `method`.
+/// Rewrites the archive at `path`: changes its `meta.json` by `change`, and compresses all files in it by `method`.
 fn rewrite(path: &Path, method: CompressionMethod, change: impl FnOnce(&mut Value)) {
     let (mut text, names) = meta(path);
     change(&mut text);

@@ -111,7 +111,7 @@ pub(super) enum Field {
 }
 
 impl Field {
-    /// Returns the number of bytes of the field.
+    /// Returns the number of bytes that the field takes in each row.
     pub(super) fn bytes(self) -> usize {
         match self {
             Field::F32(_) => 4,
@@ -352,8 +352,8 @@ fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, extra_offset:
 /// Appends one row for each Gaussian to `out`; a row consists of `fields`. Returns `None` if the content of the archive
 /// has no values for a field.
 ///
-/// `extra_offset` is the number of bytes of [`ArchiveContent::extra_bytes`], per Gaussian, that were used before. The
-/// function adds the number that these rows use.
+/// `extra_offset` is the number of bytes of [`ArchiveContent::extra_bytes`], per Gaussian, that earlier parts of the
+/// files have used. The function adds the number that these rows use.
 fn add_rows(content: &ArchiveContent, fields: &[Field], extra_offset: &mut usize, out: &mut Vec<u8>) -> Option<()> {
     let (count, start) = (content.cloud.len(), out.len());
     if count == 0 {

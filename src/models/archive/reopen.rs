@@ -1,5 +1,5 @@
 //! Makes the content of an archive (`.gsz`) from a compressed model, and opens the model in an archive to read its
-//! frames. For model formats whose files an archive stores together with a layout.
+//! frames. Used by the model formats whose files an archive stores together with a layout.
 
 use std::path::Path;
 
@@ -58,7 +58,7 @@ impl Reopener {
         Packer::new(reduction.len(), degree, self.options.memory).add(&path, holds)
     }
 
-    /// Opens the model that `content`, the content of an archive, holds, and returns its frames at `times`.
+    /// Opens the model whose archive has the content `content`, and returns its frames at `times`.
     ///
     /// # Errors
     /// Fails if `content` is not a complete model.

@@ -14,8 +14,8 @@ use crate::outputs::kind::OutputKind;
 /// Number of Gaussians of the test archive.
 const COUNT: usize = 3;
 
-/// Returns the content of an archive of two files. The first file has a header, rows of Gaussians, a tensor, zeros and
-/// a tail.
+/// Returns the content of an archive of two files. The first file consists of a header, rows of Gaussians, a tensor,
+/// zeros and further bytes. The second file has no values: the archive stores all its bytes unchanged.
 fn content() -> ArchiveContent {
     let mut content = ArchiveContent { cloud: Gaussians::zeros(COUNT, 0), ..ArchiveContent::default() };
     (0..COUNT).for_each(|i| content.cloud.position.set_row(i, [i as f32, 0.5, -1.0]));

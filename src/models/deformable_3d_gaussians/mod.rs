@@ -61,7 +61,8 @@ impl DeformableMotion {
 }
 
 impl DeformableMotion {
-    /// Returns the network's outputs at `time` that are needed for the attributes `want` of a block of Gaussians.
+    /// Returns the network's outputs at `time` for a block of Gaussians with the encoded canonical positions `encoded`:
+    /// only those outputs on which the attributes `want` depend.
     fn motion(&self, time: f64, encoded: &EncodedPositions, want: Attributes) -> Result<PredictedMotion> {
         let mut motion = PredictedMotion::default();
         let shape = if (want & SHAPE).is_empty() { Attributes::empty() } else { SHAPE };
@@ -195,8 +196,9 @@ fn screw(x: [f32; 3], [a, b, c, d, e, f]: [f32; 6]) -> [DVec3; 3] {
     [x, [a, b, c], [d, e, f]].map(|row| DVec3::from(row.map(f64::from)))
 }
 
-/// Returns the covariance R(q)·S²·R(q)ᵀ of a deformed Gaussian as xx xy xz yy yz zz. `by` holds the network's outputs
-/// for scale and rotation.
+/// Returns the covariance R(q)·S²·R(q)ᵀ of a deformed Gaussian as xx xy xz yy yz zz. `scales` and `rotation`
+/// (quaternion wxyz of any length) are those of the canonical Gaussian. `by` holds the network's outputs that are added
+/// to the scales and to the normalized quaternion.
 fn covariance(scales: [f64; 3], rotation: [f64; 4], by: ([f32; 3], [f32; 4])) -> [f64; 6] {
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-12);
     let [w, x, y, z] = [0, 1, 2, 3].map(|c| rotation[c] / length + f64::from(by.1[c]));

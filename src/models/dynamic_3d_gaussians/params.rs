@@ -48,7 +48,8 @@ pub(super) struct Params {
 
 impl Params {
     /// Opens the file at `path`. Frame i of T frames has the time i / (T − 1). Arrays that are compressed or not f32
-    /// are decoded into temporary files in the folder `scratch`. `reopener` opens archives of the model.
+    /// are decoded into temporary files in the folder `scratch`. `reopener` serves to open the model again from an
+    /// archive.
     ///
     /// # Errors
     /// Fails if the file is not an `.npz` archive, if arrays are missing or have other shapes, or if the model is
@@ -123,7 +124,7 @@ impl Params {
         &self.npz
     }
 
-    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened.
+    /// Returns the function and options with which the model was opened, to open it again from an archive.
     pub(super) fn reopener(&self) -> &Reopener {
         &self.reopener
     }

@@ -274,8 +274,8 @@ pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
     root.join("point_cloud").join(format!("iteration_{iteration}"))
 }
 
-/// Returns the size in bytes of the three files of a model (point cloud, deformation field and configuration), each as
-/// its own part.
+/// Returns the size in bytes of a model, divided into its three files: the point cloud, the deformation field and the
+/// configuration.
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<ModelSize> {
     let (cloud, field, rest) = (bytes_read_for([cloud])?, bytes_read_for([field])?, bytes_read_for([configuration])?);
     Ok(ModelSize { cloud, field, rest, ..ModelSize::default() })

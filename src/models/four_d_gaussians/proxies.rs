@@ -16,14 +16,15 @@ use crate::source::FrameSource;
 const SAMPLED_FRAMES: usize = 16;
 
 /// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of the clusters `all`. They
-/// are the merged state of the cluster at the reference frame, minus the changes (deltas) that the field makes there at
-/// the canonical position of the leader (the most important member of the cluster).
+/// are the merged state of the cluster at the reference frame, minus the changes (deltas) that the field makes at this
+/// frame to the leader (the most important member of the cluster). `merge` selects whether a proxy is placed at the
+/// mean of its members or at the canonical position of its leader.
 ///
-/// The field at the mean of the members moves a proxy that is placed there, so it may drift away from its members.
-/// There are two exceptions:
-/// - If a proxy placed at the mean drifts further than `max_drift` from its members, it is placed at its leader's
-///   canonical position. Its shape about the mean stays the same.
-/// - A proxy without a finite solution gets all parameters of its leader.
+/// Two kinds of proxies get other parameters:
+/// - A proxy at the mean may drift away from its members, because the field moves it differently. If the distance
+///   exceeds `max_drift` of `merge`, the proxy is placed at the canonical position of its leader; its other parameters
+///   stay the same.
+/// - A proxy with a parameter that is not finite gets all parameters of its leader.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -147,8 +148,8 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
 }
 
 /// Returns for each proxy (Gaussian that replaces a merged cluster) the largest distance, over sampled frames, between
-/// its position and its expected position, in scene units. `placements` states where each proxy was placed; the
-/// expected position at a frame follows from it:
+/// its position and its expected position, in scene units. `raw` holds the stored parameters of the proxies.
+/// `placements` states where each proxy was placed; the expected position at a frame follows from it:
 /// - Placed at the mean: the weighted mean of the members of its cluster.
 /// - Placed at the leader (the most important member): this mean, plus the offset of the leader from the mean at the
 ///   reference frame.

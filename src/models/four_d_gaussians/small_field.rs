@@ -104,7 +104,7 @@ mod tests {
         Tensor { shape: shape.to_vec(), data }
     }
 
-    /// Returns a stored tensor in full, expanded by the definition of strides.
+    /// Returns the tensor `stored` with all its elements, each read at the index that its strides give.
     fn read(stored: &StoredTensor) -> Tensor {
         let mut data = vec![stored.offset];
         for (&extent, &stride) in stored.shape.iter().zip(&stored.stride) {

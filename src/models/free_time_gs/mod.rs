@@ -185,7 +185,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     })
 }
 
-/// Returns the place of the tensor `name` in the checkpoint, for error messages.
+/// Returns a text for error messages that states where the checkpoint holds the tensor `name`.
 fn place(name: &str) -> String {
     format!("splats[{}]", quoted(name))
 }

@@ -199,7 +199,8 @@ fn model_without_velocities_is_static_with_any_sh_degree() {
     assert_eq!(gather_all(left.source(), 0, Attributes::all()).unwrap(), whole.pick(&[1, 2]));
 }
 
-/// Returns the bytes of a checkpoint of `splats` without optimizers, whose names of tensors begin with `prefix`.
+/// Returns the bytes of a checkpoint with the tensors `splats` and no optimizers. `prefix` is put before the names of
+/// the tensors.
 fn bare_file(splats: &Splats, prefix: &'static str) -> Vec<u8> {
     let tensors = splats.iter().enumerate().map(|(k, (name, row, values))| {
         let name: &'static str = Box::leak(format!("{prefix}{name}").into_boxed_str());

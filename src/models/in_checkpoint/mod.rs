@@ -89,7 +89,7 @@ pub(super) struct ModelDescription {
     pub(super) root: Option<PathBuf>,
     /// Path of the checkpoint file.
     pub(super) file: PathBuf,
-    /// Reopener of the model, which opens archives of the model as the model itself was opened; `None` if there is
+    /// Function and options with which the model was opened, to open it again from an archive; `None` if there are
     /// none.
     pub(super) reopener: Option<Reopener>,
     /// Notes for the user.
@@ -136,8 +136,8 @@ impl<L: ProxyRule> CheckpointModel<L> {
         found
     }
 
-    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened. Fails if
-    /// the model has none.
+    /// Returns the function and options with which the model was opened, to open it again from an archive. Fails if the
+    /// model has none.
     fn reopener(&self) -> Result<&Reopener> {
         self.description.reopener.as_ref().ok_or_else(|| Error::internal("a model does not know how it was opened"))
     }
@@ -310,8 +310,9 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 }
 
 /// Writes the compressed model `reduction` of `model` to `path` as `kind`, any kind of output except
-/// [`OutputKind::Model`]. If `kind` can store the motion of the model as it is, the motion is not fitted. Readers keep
-/// at most `held` frames in memory. Returns notes for the user.
+/// [`OutputKind::Model`]. A player format that can store the motion of the model gets this motion; any other format
+/// gets the states of the Gaussians at the frames, of which readers keep at most `held` in memory. Returns notes for
+/// the user.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.

@@ -49,7 +49,7 @@ impl ReceivedFrames {
         })
     }
 
-    /// Writes the next frame to a PLY file; `time` is its time stamp.
+    /// Writes `state`, the Gaussians of the next frame, to a PLY file. `time` is the time stamp of the frame.
     fn push(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
         self.times.push(time);

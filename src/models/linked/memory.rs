@@ -13,8 +13,8 @@ use crate::tracking::{Joiner, Linker};
 /// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time; a single frame may be
 /// larger.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
-/// Bytes of memory that each Gaussian of a frame takes in two lists: the (track, row) pairs of the frame, and a sorted
-/// copy of them.
+/// Bytes of memory that each Gaussian of a frame takes in two lists. The first list holds its track (Gaussian followed
+/// through frames) and its row number in the file of the frame; the second is a sorted copy of the first.
 const BYTES_PER_ROW: u64 = 16;
 /// Number of frames that are rendered before and after tracks (Gaussians followed through frames) are joined or
 /// attributes are made constant, to measure the change.
@@ -71,9 +71,11 @@ impl Sizes {
         (8 + 4 + size_of::<Attributes>() as u64) * self.linked
     }
 
-    /// Returns the bytes of memory that linking frames into tracks (Gaussians followed through frames) takes: a frame
-    /// and its compared attributes, the tracks that may continue, and for every track the row of its first frame and
-    /// its last state.
+    /// Returns the bytes of memory that linking frames into tracks (Gaussians followed through frames) takes. It is the
+    /// sum of:
+    /// - the largest frame: its file, its attributes, and the values that are compared to link it
+    /// - for each track that may continue in the next frame: the values with which that frame is compared
+    /// - for each track: its first frame and row, and lists for joining tracks
     fn linking(&self) -> u64 {
         let of_frame = self.file() + self.state() + Linker::BYTES_PER_GAUSSIAN as u64 + BYTES_PER_ROW;
         let of_living = (Linker::BYTES_PER_TRACK + Joiner::BYTES_PER_OPEN_TRACK) as u64;
@@ -81,10 +83,12 @@ impl Sizes {
         self.frame_gaussians * of_frame + self.live_tracks * of_living + self.linked * of_track
     }
 
-    /// Returns the bytes of memory that making attributes constant takes: the memory of the open frames, the first row
-    /// and the length of each track (Gaussian followed through frames), and the larger of two steps:
-    /// - computing means, which takes sums for a batch of tracks and one frame per thread,
-    /// - rendering, which takes the sampled frames before and after the change, and their renders.
+    /// Returns the bytes of memory that making attributes constant along tracks (Gaussians followed through frames)
+    /// takes. It is the sum of:
+    /// - the memory of the open frames ([`Sizes::open`])
+    /// - for each track: its first frame and row, and the number of its frames
+    /// - the larger one of two steps: computing means takes sums for a batch of tracks and one frame per thread;
+    ///   rendering takes the sampled frames before and after the change, and their renders
     ///
     /// Joining tracks reads as many frames as computing means and needs less memory per track, so it is not counted
     /// separately.
@@ -99,9 +103,12 @@ impl Sizes {
         self.open() + 2 * 8 * self.linked + summing.max(rendering)
     }
 
-    /// Returns the bytes of memory that packing tracks (Gaussians followed through frames) into a container takes: a
-    /// block of frames, the last row of each track, and for each thread a tile (block of Gaussians × frames) of every
-    /// column.
+    /// Returns the bytes of memory that packing tracks (Gaussians followed through frames) into a container takes. It
+    /// is the sum of:
+    /// - the memory of the open frames ([`Sizes::open`])
+    /// - for each track: the frame and row of its last Gaussian so far
+    /// - the files of a block of consecutive frames
+    /// - for each thread: a tile (block of Gaussians × frames) of every column
     fn packing(&self) -> u64 {
         let frames = self.frame_block() as u64;
         let blocks = (GAUSSIAN_BLOCK as u64).min(self.linked) * (3 * frames + 4) * self.state();

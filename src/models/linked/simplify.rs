@@ -26,9 +26,10 @@ const VIEWS: usize = 3;
 /// large as the differences that trainers leave between tracks of one Gaussian; the second is half as large.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
-/// Joins tracks (Gaussians followed through frames) that seem to be the same Gaussian. Tries the proposals of `joiner`
-/// in order and keeps the first one with which renders reach [`MIN_PSNR_DB`]. Returns a note for the user if the joiner
-/// proposed to join any tracks.
+/// Joins those of `tracks` (Gaussians followed through frames) that seem to be the same Gaussian. `joiner` proposes two
+/// ways to join them. The proposals are tried in order, and the first one with which renders reach [`MIN_PSNR_DB`] is
+/// kept; if there is none, no tracks are joined. `linker` is the linker that made the tracks. Returns a note for the
+/// user if a proposal joins any tracks.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.

@@ -325,8 +325,9 @@ impl LinkedTracks {
     }
 
     /// Writes the states of all tracks (Gaussians followed through frames) at all frames to the container `path`.
-    /// Tracks that begin in the same frame are neighbors. If no track of a block is present in successive frame blocks
-    /// (all have ended or not begun yet), the block is encoded only once for these frame blocks.
+    /// Tracks are in the order of their first frames, so the tracks of a block of Gaussians are often absent together.
+    /// If they are absent from several successive blocks of frames, the block of Gaussians is encoded only for the
+    /// first of these.
     pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());

@@ -40,8 +40,10 @@ pub(super) trait MotionModel: Debug + Send + Sync {
     /// [`MotionModel::jacobian`] covers them.
     fn movable(&self) -> Attributes;
 
-    /// Computes the attributes `want` of the states at `time` and writes them to `out`, whose attributes already have
-    /// the right length. Called with at most [`GAUSSIANS_PER_BLOCK`] Gaussians at once, from many threads.
+    /// Computes the attributes `want` of the states at `time` of the Gaussians with the stored parameters `raw`.
+    /// `prepared` holds the values that [`MotionModel::prepare`] returned for `raw`. Writes the states to `out`, whose
+    /// attributes already have the right length. Called with at most [`GAUSSIANS_PER_BLOCK`] Gaussians at once, from
+    /// many threads.
     ///
     /// Implementations are always inlined, so that loops over Gaussians are compiled for wider registers. No operation
     /// is fused, so the bits are the same on every machine.
@@ -58,7 +60,9 @@ pub(super) trait MotionModel: Debug + Send + Sync {
     ) -> Result<()>;
 
     /// Returns the derivative of the attributes `want` of the states at `time` with respect to
-    /// [`StoredParams::gaussians`]. The default is the identity: states change by as much as stored values do.
+    /// [`StoredParams::gaussians`] of the stored parameters `raw`. `prepared` holds the values that
+    /// [`MotionModel::prepare`] returned for `raw`. The default is the identity: states change by as much as stored
+    /// values do.
     ///
     /// # Errors
     /// Fails if the model cannot be evaluated.

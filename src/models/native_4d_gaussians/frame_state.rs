@@ -99,7 +99,8 @@ impl Native {
         Slice { velocity, variance, covariance: Some(covariance) }
     }
 
-    /// Returns −1/(2 Σ_tt) for the variance in time `variance`, to which `prefilter` is added.
+    /// Returns −1/(2 (Σ_tt + p)) for the variance in time Σ_tt = `variance` and the constant p = `prefilter` (0 if
+    /// negative).
     fn rate(&self, variance: f64) -> f64 {
         -0.5 / (variance + self.prefilter.max(0.0))
     }
@@ -111,7 +112,8 @@ impl Native {
         if m > MIN_MARGINAL { m } else { 0.0 }
     }
 
-    /// Returns the waves cos(2π(μ − t)/L) and cos(4π(μ − t)/L) of the colors, for time t, center μ and period L.
+    /// Returns the factors cos(2π(μ − t)/L) and cos(4π(μ − t)/L) of the two time-dependent SH terms, for `time` t,
+    /// `center` μ and period L of the colors.
     pub(super) fn waves(&self, time: f64, center: f64) -> [f64; 2] {
         let wave = (TAU * (center - time) / self.period).cos();
         [wave, 2.0 * wave * wave - 1.0]

@@ -152,7 +152,8 @@ fn motion_model(
 }
 
 /// Returns the values of a capture tuple (training state in the checkpoint) that only the training reads: statistics,
-/// and the tensors of the optimizer. `parts` are all values of the tuple.
+/// and the tensors of the optimizer. `parts` are all values of the tuple. `is_4d` states that they belong to a 4D
+/// model, not to a static one.
 fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId> {
     let (optimizer, statistics) = if is_4d { (11, 7..11) } else { (10, 7..10) };
     let mut nodes: Vec<NodeId> = parts[statistics].to_vec();
@@ -163,8 +164,8 @@ fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId>
     nodes
 }
 
-/// Returns the place of value `i` of a capture tuple (training state in the checkpoint), called `name`, for error
-/// messages.
+/// Returns a text for error messages that identifies value `i`, called `name`, of a capture tuple (training state in
+/// the checkpoint).
 fn place(i: usize, name: &str) -> String {
     format!("capture[{i}] ({name})")
 }

@@ -30,14 +30,14 @@ fn reversed(a: &Matrix) -> Matrix {
     [3, 2, 1, 0].map(|i| [3, 2, 1, 0].map(|j| a[i][j]))
 }
 
-/// Returns the quaternion scaled to length 1; the quaternion 1 for a quaternion of length 0.
+/// Returns the quaternion `q` scaled to length 1; the identity (1, 0, 0, 0) if its length is 0.
 fn unit(q: [f64; 4]) -> [f64; 4] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
 }
 
 /// Returns the rotation matrix of the left and the right quaternion, which may have any length; length 0 counts as the
-/// quaternion 1. If `flipped`, the order of rows and columns is reversed, as in checkpoints since 15 September 2024.
+/// identity. If `flipped`, the order of rows and columns is reversed, as in checkpoints since 15 September 2024.
 pub(super) fn rotation([l, r]: [[f64; 4]; 2], flipped: bool) -> Matrix {
     let whole = product(&left(unit(l)), &right(unit(r)));
     if flipped { reversed(&whole) } else { whole }

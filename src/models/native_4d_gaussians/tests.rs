@@ -136,7 +136,8 @@ fn rule() -> crate::recipe::MergeParams {
 
 /// Checks row `row` of `state`, the state at `time`, against an independent computation from `parameters`. The spatial
 /// covariance at a time is the inverse of the spatial block of the inverse of Σ₄. The rotation is computed by applying
-/// the quaternions to each axis.
+/// the quaternions to each axis. `flipped` states that the order of rows and columns of the rotation matrix is
+/// reversed.
 fn check(parameters: &[(usize, PickledTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
     let values = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
     let unit = |q: Vec<f64>| DVec4::from_slice(&q).normalize().to_array();
@@ -313,7 +314,8 @@ fn captures_without_an_optimizer_are_read_and_written() {
     assert_eq!(states(&*left), expected.iter().map(|state| state.pick(&[1, 4])).collect::<Vec<_>>());
 }
 
-/// Checks tensors in half precision, and a tensor whose rows are each stored after an unused row.
+/// Checks that tensors in two half-precision formats (bfloat16 and float16) are read correctly. The bfloat16 tensor has
+/// an unused row after each row.
 #[test]
 fn half_precision_and_strides_in_captures_are_read() {
     let folder = CheckpointFolder::new();

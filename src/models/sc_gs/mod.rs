@@ -214,7 +214,8 @@ fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> Attrib
 }
 
 impl NodeMotion {
-    /// Returns the network's output at `time` for a block of Gaussians, as far as the attributes `want` need it.
+    /// Returns the network's outputs at `time` for the block of Gaussians from which `prepared` was computed: only
+    /// those outputs on which the attributes `want` depend.
     fn motion(&self, time: f64, prepared: &PreparedNodes, want: Attributes) -> Result<PredictedMotion> {
         let (mut motion, want) = (PredictedMotion::default(), want & self.network.deformed_attributes());
         match (prepared, &self.nodes) {
@@ -354,8 +355,9 @@ fn add_to_opacity(stored: f32, by: f32) -> f64 {
     logit(alpha.clamp(0.0, 1.0)).clamp(-MAX_LOGIT, MAX_LOGIT)
 }
 
-/// Returns the derivatives of the positions at `time` with respect to the stored positions, for Gaussians that follow
-/// nodes. They include the change of the node weights with the position.
+/// Returns the derivatives of the positions of the Gaussians `raw` at `time` with respect to their stored positions,
+/// for a model whose Gaussians follow the control nodes `sparse`. They include the change of the node weights with the
+/// position. Component 3i + k of a row is the derivative of coordinate i with respect to stored coordinate k.
 fn position_slopes(sparse: &CachedNodes, network: &Network, raw: &StoredParams, time: f64) -> Result<AttributeValues> {
     let motion = sparse.motion(network, time)?;
     let (mut out, mut shares) = (AttributeValues::zeros(9, raw.len()), Vec::new());

@@ -114,7 +114,7 @@ impl PointCloudFile {
         Ok([values("f_dc_0")?, values("f_dc_1")?, values("f_dc_2")?])
     }
 
-    /// Fails if a value of the property `name` is not finite.
+    /// Fails if one of `values`, which are the values of the property `name` of all Gaussians, is not finite.
     fn check(&self, name: &str, values: &[f32]) -> Result<()> {
         match values.iter().position(|x| !x.is_finite()) {
             Some(row) => {
@@ -183,7 +183,8 @@ impl PointCloudFile {
     }
 }
 
-/// Returns the name of the property for each parameter in [`StoredParams::format_specific`].
+/// Returns the name of the PLY property of each parameter in [`StoredParams::format_specific`], in order: for the full
+/// model if `is_full`, else for the lite model.
 fn own_property_names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
     let mut names: Vec<String> = vec![MARKER_PROPERTY.to_owned(), "trbf_scale".to_owned()];

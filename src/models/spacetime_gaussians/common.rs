@@ -7,7 +7,8 @@ use crate::models::trajectories::state_bytes;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 
-/// Returns the memory and reading costs of an open model that has `width` format-specific parameters per Gaussian.
+/// Returns how much memory an open model takes, and how much time and memory reading it takes. `width` is the number of
+/// its format-specific parameters per Gaussian.
 pub(super) fn residence(width: usize) -> MemoryProfile {
     let whole = state_bytes(0, Attributes::all()) + 4 * width as u64;
     MemoryProfile {
@@ -28,8 +29,9 @@ pub(super) fn residence(width: usize) -> MemoryProfile {
     }
 }
 
-/// Fails if a SpacetimeGaussians model cannot be written as the kind of output `kind`: a full model (`is_full`) not as
-/// `.splatv`, which stores no features. The caller checks model folders and single PLY files.
+/// Fails if a SpacetimeGaussians model cannot be written as the kind of output `kind`: a full model (`is_full`) cannot
+/// be written as `.splatv`, which stores no features. The caller itself checks whether a model folder or a single PLY
+/// file can be written.
 pub(super) fn check_kind(kind: OutputKind, is_full: bool) -> Result<()> {
     match kind {
         OutputKind::Splatv if is_full => Err(Error::usage(

@@ -31,7 +31,7 @@ pub(super) const FEATURES_IN_TIME: usize = 21;
 pub(super) const FULL_WIDTH: usize = 24;
 
 impl SpacetimeMotion {
-    /// Returns the motion and temporal window of the Gaussian in row `row`.
+    /// Returns the motion and temporal window of the Gaussian in row `row` of `raw`.
     pub(super) fn from_raw(raw: &StoredParams, row: usize) -> SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.format_specific.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
@@ -178,8 +178,8 @@ impl MotionModel for Spacetime {
 }
 
 impl Shading for Spacetime {
-    /// Returns nine features per Gaussian: six that are constant, and three that grow with the time since the center of
-    /// the temporal window.
+    /// Returns nine features for each Gaussian of `raw` at `time`: six that are constant in time, then three that are
+    /// proportional to the time since the center of the temporal window.
     fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues {
         let mut found = AttributeValues::zeros(decoder::FEATURES, raw.len());
         let centers = raw.format_specific.plane(CENTER);

@@ -88,7 +88,8 @@ struct Files {
 }
 
 impl Files {
-    /// Finds the files of the model at `path`, of the requested training iteration or the largest.
+    /// Finds the files of the model folder or PLY file `path`. In a folder, they belong to the training iteration of
+    /// `options`, or to the largest if `options` gives none.
     fn find(path: &Path, options: &OpenOptions) -> Result<Files> {
         if !path.is_dir() {
             options.refuse_for(path)?;

@@ -99,7 +99,8 @@ impl ClusterMembers<'_> {
     }
 }
 
-/// Computes the stored parameters of the proxy (Gaussian that replaces merged ones) of `cluster`, in one row.
+/// Computes the stored parameters of one proxy, the Gaussian that replaces the members of `cluster`, as a single row.
+/// `activation` turns the first three features of the full model into colors.
 fn proxy_parameters(
     model: &MotionModelFrames<Spacetime>,
     cluster: &Cluster,
@@ -215,7 +216,7 @@ fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], moti
     found.scales.to_array().map(|scale| scale.max(1e-7).ln())
 }
 
-/// Returns the quaternion scaled to length 1; the identity if it has no direction.
+/// Returns the quaternion (w, x, y, z) scaled to length 1; the identity if its length is 0 or not finite.
 fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
     let found = DQuat::from_xyzw(x, y, z, w).normalize();
     if found.is_finite() { found } else { DQuat::IDENTITY }

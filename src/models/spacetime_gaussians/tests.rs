@@ -13,7 +13,8 @@ use crate::recipe::Recipe;
 
 const COUNT: usize = 7;
 
-/// Returns the names of the properties of the PLY file in the order in which the training writes them.
+/// Returns the names of the properties of the PLY file in the order in which the training writes them: of the full
+/// model if `is_full`, else of the lite model.
 fn properties(is_full: bool) -> Vec<String> {
     let numbered = |name: &str, count: usize| (0..count).map(|k| format!("{name}_{k}")).collect::<Vec<_>>();
     let mut names: Vec<String> =
@@ -62,7 +63,7 @@ fn write_decoder(path: &Path, tensors: &Tensors) {
 const CFG_ARGS_TEXT: &str =
     "Namespace(model='ours', duration=50, white_background=True, source_path='data/x', rgbfunction='sandwich')";
 
-/// Writes a model folder with two iterations, as the training does.
+/// Writes a model folder with two training iterations: of the full model if `is_full`, else of the lite model.
 fn folder(is_full: bool) -> tempfile::TempDir {
     let root = tempfile::tempdir().unwrap();
     for number in [7, 300] {

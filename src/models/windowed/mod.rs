@@ -44,14 +44,14 @@ struct WindowedModel<L: ProxyRule> {
     /// Notes for the user: repairs and guesses made while the file was opened.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
-    /// Reopener, which opens the `.ftgs.ply` in an archive of this file as the file itself was opened. `None` for
-    /// Gaussians without windows of time, which a `.ftgs.ply` cannot hold; their archives hold frames.
+    /// Function and options to open the `.ftgs.ply` in an archive of this file. `None` for Gaussians without windows of
+    /// time: a `.ftgs.ply` cannot hold them, so archives of this file hold frames instead.
     reopener: Option<Reopener>,
 }
 
 impl<L: ProxyRule> WindowedModel<L> {
-    /// Returns the reopener, which opens the `.ftgs.ply` in an archive of this file as the file itself was opened.
-    /// Fails if the archives of this file hold frames instead.
+    /// Returns the function and options to open the `.ftgs.ply` in an archive of this file. Fails if archives of this
+    /// file hold frames instead.
     fn reopener(&self) -> Result<&Reopener> {
         self.reopener.as_ref().ok_or_else(|| Error::internal("an archive of frames was written as a model"))
     }

@@ -40,9 +40,9 @@ const NAME: &str = "archive";
 /// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
 /// coarser step would round nearly all values to the same number.
 const MAX_STEP: f64 = 4.0;
-/// Smallest standard deviation from which the quantization step of a column is computed, as a fraction of the largest
-/// magnitude in the column. A column holds values of the Gaussians that belong to no attribute, such as velocities. If
-/// all values of a column are equal, this bound gives a step about as fine as the precision of f32.
+/// Lower bound of the standard deviation from which the quantization step of a column is computed, as a fraction of the
+/// largest magnitude in the column. A column holds values of the Gaussians that belong to no attribute, such as
+/// velocities. If all values of a column are equal, this bound gives a step about as fine as the precision of f32.
 const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 /// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
 /// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this
@@ -106,8 +106,8 @@ impl ValueGroup {
         }
     }
 
-    /// Returns how many quantization steps make up one standard deviation of the values of this group before the steps
-    /// are adapted to the quality of renders. These initial steps are finer than most final ones.
+    /// Returns the number of initial quantization steps in one standard deviation of the values of this group. Initial
+    /// steps are used before the steps are adapted to the quality of renders. They are finer than most final ones.
     fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
@@ -277,9 +277,9 @@ struct Grids {
     deviations: Vec<f64>,
     /// Log2 of the quantization step of each group (attribute, column or tensor) in `groups`.
     octaves: Vec<f64>,
-    /// For each tensor, by name: numbers that are added to the log2 of its quantization step, in eighths of an octave
-    /// (doubling). A feature plane has one per channel; a matrix one per row, then one per column; any other tensor one
-    /// per element. Empty if all are 0. See [`TensorSteps::channels`].
+    /// Offsets for each tensor, by name, which are added to the log2 of its quantization step. Unit: eighths of an
+    /// octave (doubling). A feature plane has one offset per channel; a matrix one per row, then one per column; any
+    /// other tensor one per element. Empty if all are 0. See [`TensorSteps::channels`].
     offsets: BTreeMap<String, Vec<i8>>,
 }
 

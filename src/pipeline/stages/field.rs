@@ -25,8 +25,8 @@ use crate::source::FrameSource;
 
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "field";
-/// Number of views, chosen among those used for scoring, on which renders before and after a reduction of the model are
-/// compared.
+/// Number of views on which renders before and after an optional reduction of the model (half-precision deformation
+/// field, fewer SH degrees) are compared. They are chosen among the views used for scoring.
 pub(crate) const COMPARED_VIEWS: usize = 12;
 
 /// Stage that chooses the precision in which the deformation field of a result is written.

@@ -95,9 +95,9 @@ impl MeasureStages {
         [scan, visible, Some(self.score.resource_estimate(work, limits))].into_iter().flatten().collect()
     }
 
-    /// Computes the statistics of the Gaussians of `scene` and the scores of the Gaussians, and returns both. `arrived`
-    /// holds statistics that were already computed while the input, a stream, arrived; they are used instead of a new
-    /// scan.
+    /// Computes the statistics of the Gaussians of `scene`, scores the Gaussians, and selects those to keep. Returns
+    /// the statistics and the selection. `arrived` holds statistics that were already computed while the input, a
+    /// stream, arrived; they are used instead of a new scan.
     ///
     /// # Errors
     /// Fails if a stage fails.

@@ -52,8 +52,8 @@ pub(crate) const PAIRS: &str = "pairs";
 const MIN_DIVIDED_PAIRS: usize = 20_000;
 
 /// Bytes of memory of the stage for each Gaussian that may survive. The terms are, in order: its id in two lists (all
-/// such Gaussians, and the set that is being merged), its state with base colors only, and a flag whether its state is
-/// finite together with its merge class.
+/// such Gaussians, and the set that is being merged); its state with base colors only; whether its state is finite, and
+/// its merge class (only Gaussians of the same class may merge).
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
 /// Assumed number of times that the stage merges, each time a different number of survivors (Gaussians left by
@@ -61,8 +61,8 @@ const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() 
 /// ([`bracket`]) usually needs fewer.
 const USUAL_TRIALS: f64 = 16.0;
 
-/// Number of Gaussians whose full states are read at a time at the reference frame. Merging then keeps only the
-/// attributes that it uses.
+/// Number of Gaussians whose states with all attributes are read at a time, at the reference frame (at which Gaussians
+/// are compared). Merging then keeps only the attributes that it uses.
 const GATHER_CHUNK: usize = 16 * GAUSSIANS_PER_BLOCK;
 
 /// Processor time per Gaussian of finding neighbors, testing pairs and forming clusters, seconds (`benches/merge.rs`).
@@ -410,8 +410,9 @@ fn measure(
     })
 }
 
-/// Returns the compressed model of the survivors (Gaussians left by pruning), in which proxies replace the groups in
-/// `merged`, with a summary of how many Gaussians each merge pass joined.
+/// Returns the compressed model of `survivors` (Gaussians left by pruning), and a summary of how many Gaussians each
+/// merge pass joined. In the model, a proxy (one Gaussian) replaces each cluster in `merged`. `reference_frame`: frame
+/// at which the Gaussians were compared. `merge`: merge parameters.
 fn outcome(
     survivors: &Survivors<'_>,
     merged: &MergeResult,
@@ -446,7 +447,7 @@ fn outcome(
 }
 
 /// Returns the states of the Gaussians `ids` (increasing) at `frame` with base colors only, and for each Gaussian
-/// whether its full state is finite. All values are zero if there are no frames.
+/// whether all its attributes are finite. All values are zero if there are no frames.
 fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gaussians, Vec<bool>)> {
     let mut states = Gaussians::zeros(ids.len(), 0);
     let mut finite = vec![true; ids.len()];

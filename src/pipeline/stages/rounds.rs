@@ -165,11 +165,15 @@ impl Rounds {
     }
 
     /// Ranks the Gaussians of the ranking `before` anew by pruning rounds, until a round leaves at most `fewest`, and
-    /// returns the new ranking.
+    /// returns the new ranking. If no round is needed, returns `before`.
     ///
-    /// The new ranking begins with the Gaussians that must stay, by id. The other survivors of the last round follow,
-    /// then the Gaussians removed in each round, from the last round to the first. Each of these sets is sorted by
-    /// descending removal error; ties keep the order of `before`. If no round is needed, returns `before`.
+    /// The new ranking consists of these sets, in order:
+    /// - the Gaussians that must stay, sorted by id;
+    /// - the other survivors of the last round, sorted by descending removal error;
+    /// - the Gaussians removed in each round, from the last round to the first, sorted in the same way within a round.
+    ///
+    /// Gaussians with equal removal errors keep the order that they had before the round; at first, this is the order
+    /// of `before`.
     ///
     /// # Errors
     /// Fails if frames cannot be read.

@@ -73,8 +73,9 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
     }
 }
 
-/// Fetches the bytes of every unit of work into the system's file cache and sends the unit to its lane (the decoding
-/// thread and the accumulating thread that process it). Stops when a lane has ended.
+/// Fetches the bytes of every unit of work into the system's file cache with `ahead`, and sends the unit to its lane
+/// (the decoding thread and the accumulating thread that process it). `to_lanes` holds one channel per lane. Stops when
+/// a lane has ended.
 fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>>) {
     let frame_block = ahead.frame_block().max(1);
     for first in (0..scan.blocks()).step_by(to_lanes.len().max(1)) {

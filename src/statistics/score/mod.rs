@@ -109,8 +109,8 @@ pub fn score(rows: &StatisticRows, frames: usize, recipe: &recipe::ScoreParams) 
     score_with_passes(PercentilePasses::Two, rows, frames, recipe)
 }
 
-/// Computes the scores as [`score`] does. `passes` selects how percentiles are found: exactly in two passes over the
-/// values, or approximately in one.
+/// Computes the scores of the Gaussians with the statistics `rows` in a sequence of `frames` frames, like [`score`].
+/// `passes` selects how percentiles are found: exactly in two passes over the values, or approximately in one.
 pub fn score_with_passes(
     passes: PercentilePasses,
     rows: &StatisticRows,

@@ -40,7 +40,8 @@ impl NetworkOracle {
         v.iter().copied().chain(waves).collect()
     }
 
-    /// Returns the outputs of all heads (output layers) for one Gaussian, one head after the other.
+    /// Returns the outputs of all heads (output layers) for one Gaussian, one head after the other. `kind` is the
+    /// variant of the architecture, `position` the stored position.
     fn motion(&self, kind: DeepVariant, position: [f64; 3], time: f64) -> Vec<f64> {
         let relu = |x: Vec<f64>| x.into_iter().map(|x| x.max(0.0)).collect::<Vec<f64>>();
         let encoded_time = match kind.time_network {
@@ -62,7 +63,7 @@ impl NetworkOracle {
     }
 }
 
-/// Returns all outputs of the network for Gaussian `i`.
+/// Returns all outputs of the network for Gaussian `i`, in the order of the fields of [`PredictedMotion`].
 fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
     let PredictedMotion { warp, rotation, scaling, opacity, color } = motion;
     let columns = [warp, rotation, scaling, opacity, color];

@@ -150,8 +150,8 @@ mod tests {
         Max data size             unlimited            unlimited            bytes\n\
         Max address space         unlimited            unlimited            bytes\n";
 
-    /// Returns the lowest memory limit on a simulated machine with 64 GiB and the system files `files`, given as pairs
-    /// (path, content).
+    /// Returns the lowest memory limit, in bytes, and its source on a simulated machine with 64 GiB and the system
+    /// files `files`, given as pairs (path, content).
     fn limit(files: &[(&str, &str)]) -> (u64, LimitSource) {
         let root = tempfile::tempdir().unwrap();
         let machine =

@@ -36,8 +36,8 @@ const SPAN: usize = 32 * BLOCK;
 
 /// Bytes of memory per visible Gaussian for a render and for the gradient of a loss of this render.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
-/// Maximum number of (splat, tile) pairs whose gradient sums are in memory at a time. A strip (the tiles that are
-/// processed together) with more pairs is processed in parts.
+/// Maximum number of (splat, tile) pairs whose gradient sums ([`SplatSums`], sums over pixels) are in memory at a time.
+/// A strip (the tiles that are processed together) with more pairs is processed in parts.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
 /// Bytes of memory for the (splat, tile) pairs of a strip of tiles, for a render and for the gradient of a loss of this
@@ -101,10 +101,12 @@ impl Renderer {
         value
     }
 
-    /// Computes the gradient sums of every splat from `pixel_gradient`, the derivative of the loss with respect to each
-    /// value of `image`. First computes the sums over each tile, with tiles in parallel. Then adds the sums of the
-    /// tiles of each splat in a fixed order, with splats in parallel. If `SHAPE` is false, computes only the sums for
-    /// the gradients of colors.
+    /// Computes for every splat the sums over pixels from which its gradients follow ([`SplatSums`]). `pixel_gradient`
+    /// is the derivative of the loss with respect to each value of `image`. If `SHAPE` is false, computes only the sums
+    /// for the gradients of colors.
+    ///
+    /// First computes the sums of each splat over each tile; a parallel renderer divides this work by rows of tiles.
+    /// Then adds the sums of the tiles of each splat in a fixed order; a parallel renderer divides this work by splats.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();

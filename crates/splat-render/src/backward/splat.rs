@@ -1,12 +1,11 @@
-//! Derivative of the projection: computes the gradients of the stored attributes of Gaussians from the gradient sums of
-//! their splats.
+//! Derivative of the projection: computes the gradients of the stored attributes of Gaussians from gradient sums, the
+//! sums over the pixels of their splats ([`SplatSums`]).
 //!
-//! Blocks are processed like in the projection, in f64 where the projection uses f64. The covariance of a footprint is
-//! not inverted; instead, offsets in the footprint are expressed in its standard deviations. Very thin and very large
-//! Gaussians then lose no digits that the projection kept (docs/method.md, section 8.1). Input: gradient sums of
-//! splats. Output: gradients of Gaussians. Memory: stack arrays of [`BLOCK`] entries. Source of the projection: Zwicker
-//! et al., "EWA Splatting", 2002. Names that begin with `by_` hold derivatives of the loss with respect to the rest of
-//! the name.
+//! Gaussians are processed in blocks like in the projection, in f64 where the projection uses f64. The covariance of a
+//! footprint is not inverted; instead, offsets in the footprint are expressed in its standard deviations. Very thin and
+//! very large Gaussians then lose no digits that the projection kept (docs/method.md, section 8.1). Input: gradient
+//! sums of splats. Output: gradients of Gaussians. Memory: stack arrays of [`BLOCK`] entries. Source of the projection:
+//! Zwicker et al., "EWA Splatting", 2002. A variable `by_x` holds the derivative of the loss with respect to `x`.
 
 use std::ops::Range;
 
@@ -17,7 +16,7 @@ use super::sums::SplatSums;
 use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficients};
 
 /// Computes the gradients of the Gaussians whose projections are `splats`, and adds them to `out`, which must contain
-/// these Gaussians. `sums` holds the gradient sums of each splat over its pixels.
+/// these Gaussians. `sums` holds for each splat the sums over its pixels from which the gradients follow.
 pub(super) fn add(
     gaussians: &Gaussians,
     splats: &[Splat],
@@ -133,7 +132,8 @@ impl Directions {
     }
 }
 
-/// Gradient sums of the splats of a block of Gaussians, see [`SplatSums`]; 0 for Gaussians that are not visible.
+/// Sums over pixels, for each Gaussian of a block, from which its gradients follow: the values of [`SplatSums`], or 0
+/// for a Gaussian that is not visible.
 struct GradientBlock {
     p: [f64; BLOCK],
     first: [[f64; BLOCK]; 2],
@@ -150,8 +150,8 @@ impl Default for GradientBlock {
 }
 
 impl GradientBlock {
-    /// Copies the gradient sums `sums` of the `splats` of this block. `start` is the index of the first Gaussian of the
-    /// block.
+    /// Sets the sums of the whole block: copies `sums`, the sums over pixels of each of the `splats` of the block, and
+    /// sets the sums of all other Gaussians to 0. `start` is the index of the first Gaussian of the block.
     fn fill(&mut self, splats: &[Splat], sums: &[SplatSums<f64>], start: usize) {
         *self = GradientBlock::default();
         for (splat, sums) in splats.iter().zip(sums) {
@@ -188,8 +188,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds to `out` one of the two parts of the gradients of positions: moving a Gaussian changes its view direction,
-    /// and thereby its color.
+    /// Adds to `out` the part of the gradients of positions that comes from colors: moving a Gaussian changes its view
+    /// direction, and thereby its color. [`GradientBlock::add_shape`] adds the other part.
     #[inline(always)]
     fn add_direction(
         &self,
@@ -228,8 +228,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds the gradients of opacity, scale and rotation to `out`. Also adds the second part of the gradients of
-    /// positions: moving a Gaussian changes the place and the shape of its footprint.
+    /// Adds the gradients of opacity, scale and rotation to `out`. Also adds the part of the gradients of positions
+    /// that comes from footprints: moving a Gaussian moves its footprint and changes the footprint's shape.
     #[inline(always)]
     fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
@@ -280,9 +280,9 @@ struct GeometryGradient {
 }
 
 impl GeometryGradient {
-    /// Computes the derivatives for one Gaussian from its stored attributes and from the gradient sums of its splat.
-    /// `q` is the quaternion in the order w, x, y, z; `[x, y]` is [`SplatSums::first`], and `[xx, xy, yy]` is
-    /// [`SplatSums::second`].
+    /// Computes the derivatives for one Gaussian from its stored attributes and from two sums over the pixels of its
+    /// splat: `[x, y]` is [`SplatSums::first`], and `[xx, xy, yy]` is [`SplatSums::second`]. `q` is the quaternion in
+    /// the order w, x, y, z.
     #[inline(always)]
     fn new(
         position: [f64; 3],

@@ -1,4 +1,5 @@
-//! Gradient sums of splats over pixels: per tile that a splat touches, and over all tiles.
+//! Gradient sums: sums over pixels from which the gradients of splats are computed, per tile that a splat touches and
+//! over all tiles.
 
 /// Sums over pixels from which the gradients of one splat are computed: f32 sums over a tile in a fixed order, or f64
 /// sums over tiles.
@@ -30,11 +31,12 @@ impl SplatSums<f64> {
     }
 }
 
-/// Gradient sums of all splats of a render.
+/// Gradient sums ([`SplatSums`], sums over pixels) of all splats of a render.
 #[derive(Debug, Default)]
 pub(in super::super) struct ImageGradientSums {
-    /// Gradient sums of every splat over all tiles.
+    /// Sums of every splat over the pixels of all tiles.
     pub(super) totals: Vec<SplatSums<f64>>,
-    /// Gradient sums of every (splat, tile) pair of a strip of tiles, or of a part of it.
+    /// Sums of each splat over the pixels of one tile, for every (splat, tile) pair of a strip of tiles or of a part of
+    /// the strip.
     pub(super) pairs: Vec<SplatSums<f32>>,
 }

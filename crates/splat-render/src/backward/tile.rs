@@ -1,9 +1,10 @@
-//! Backward pass over a tile: computes gradient sums of splats from the gradients of pixels.
+//! Backward pass over a tile: computes, from the gradients of pixels, the sums over pixels from which the gradients of
+//! splats follow.
 //!
 //! The pass runs front to back again, so that no list of blended splats has to be kept. Each splat subtracts its weight
 //! times its color from the color of a pixel. The remaining color comes from behind the splat (docs/method.md, section
 //! 8.1). Input: the splats of the tile, ∂L/∂pixel, and the pixels. Output: nine sums per splat of the tile
-//! ([`SplatSums`]). Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
+//! ([`SplatSums`]). A variable `by_x` holds the derivative of the loss with respect to `x`.
 
 use super::super::blend::{BlendSink, Fragment, GROUPS, TilePlane};
 use super::super::convention::{MAX_ALPHA, TILE};
@@ -49,15 +50,15 @@ impl PixelGradients {
     }
 }
 
-/// Receiver of weights (alpha · transmittance of each splat) that computes the gradient sums of the splats of a tile.
-/// If `SHAPE` is false, it computes only the sums for the gradients of colors.
+/// Receiver of weights (alpha · transmittance of each splat) that computes, for each splat of a tile, the sums over
+/// pixels from which its gradients follow. If `SHAPE` is false, it computes only the sums for the gradients of colors.
 pub(super) struct GradientSink<'a, const SHAPE: bool> {
     pub(super) gradients: PixelGradients,
-    /// Gradient sums of each splat of the tile.
+    /// For each splat of the tile, the sums over the pixels of the tile from which its gradients follow.
     pub(super) pairs: &'a mut [SplatSums<f32>],
 }
 
-/// Color of the splat that is being processed, and its gradient sums so far, see [`SplatSums`].
+/// Color of the splat that is being processed, and its sums over the pixels so far; see [`SplatSums`] for the sums.
 #[derive(Clone, Copy)]
 pub(super) struct SplatAccumulator<V: Lanes> {
     color: [V; 3],

@@ -94,7 +94,8 @@ impl Moments {
         Moments { sums: std::array::from_fn(|_| vec![0.0; count]), scratch: vec![0.0; count] }
     }
 
-    /// Computes the windowed sums of channel `channel` of the images `a` and `b`.
+    /// Computes the windowed sums (weighted by the Gaussian window around each pixel) of channel `channel` of the
+    /// images `a` and `b`.
     fn set_windowed(&mut self, a: &Image, b: &Image, channel: usize) {
         for (i, (a, b)) in a.data.iter().zip(&b.data).skip(channel).step_by(3).enumerate() {
             let (a, b) = (clamped(*a), clamped(*b));
@@ -107,7 +108,7 @@ impl Moments {
         }
     }
 
-    /// Returns the windowed sums of a, b, a² + b² and a·b at pixel `i`.
+    /// Returns the sums of a, b, a² + b² and a·b, weighted by the Gaussian window around pixel `i`.
     fn at(&self, i: usize) -> [f64; 4] {
         self.sums.each_ref().map(|sum| sum[i])
     }
@@ -140,8 +141,8 @@ impl Terms {
         numerators[0] * numerators[1] / (denominators[0] * denominators[1])
     }
 
-    /// Returns the derivatives of the SSIM S of the pixel with respect to the windowed sums of a, a² + b² and a·b. The
-    /// fourth value is 0.
+    /// Returns the derivatives of the SSIM S of the pixel with respect to the windowed sums of a, a² + b² and a·b, in
+    /// this order. The fourth value is 0.
     fn slopes(&self) -> [f64; 4] {
         let Terms { means: [a, b], numerators, denominators } = self;
         let (whole, s) = (denominators[0] * denominators[1], self.similarity());

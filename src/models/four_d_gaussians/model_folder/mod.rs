@@ -70,7 +70,8 @@ impl ModelPaths {
         Ok(paths)
     }
 
-    /// Returns the paths of the required files, in the order in which [`ModelPaths::digest`] reads them.
+    /// Returns the paths of the point cloud file, the deformation file and `cfg_args`, in the order in which
+    /// [`ModelPaths::digest`] reads them.
     fn required(&self) -> [&Path; 3] {
         [&self.point_cloud, &self.deformation, &self.cfg_args]
     }
