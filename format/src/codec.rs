@@ -37,7 +37,8 @@ use crate::layout::MAX_TILE_BYTES;
 pub enum Compression {
     /// Raw: plain f32 values, which readers use in place from the memory map.
     Raw,
-    /// Lossless: filter, then zstd at this level. A tile that does not become smaller is stored raw.
+    /// Lossless: the values are replaced by differences from a prediction (the filter), which zstd compresses at this
+    /// level. A tile that does not become smaller is stored raw.
     Zstd(i32),
     /// Lossy: values differ from the original ones by at most `max_error`, and zstd compresses them at `level`. A tile
     /// that does not become smaller this way, or has too many values that cannot be stored within the bound, is stored
@@ -45,7 +46,7 @@ pub enum Compression {
     Bounded {
         /// Maximum absolute error of a value, above 0; see [`crate::ColumnSpec::max_error`].
         max_error: f64,
-        /// Compression level of zstd.
+        /// Compression level of zstd for the lossy tile.
         level: i32,
     },
 }
@@ -55,14 +56,16 @@ pub enum Compression {
 pub enum Encoding {
     /// Raw: little-endian f32.
     Raw,
-    /// Lossless: differences from a prediction, shuffled and compressed by zstd.
+    /// Lossless: each value is stored as its difference from a prediction. The bytes of the differences are grouped by
+    /// significance and compressed by zstd.
     Filtered {
         /// Number of earlier frames from which a value is predicted: 0, 1 or 2.
         order: u8,
     },
-    /// Lossy: integer multiples of a step, as differences from a prediction, shuffled and compressed by zstd.
+    /// Lossy: each value is rounded to an integer multiple of a quantization step, which is stored as its difference
+    /// from a prediction. The bytes of the differences are grouped by significance and compressed by zstd.
     Bounded {
-        /// Number of earlier frames from which a multiple of the step is predicted: 1 or 2.
+        /// Number of earlier frames from which the multiple of the quantization step is predicted: 1 or 2.
         order: u8,
     },
 }
@@ -204,7 +207,7 @@ pub(crate) struct TileDecoder {
     /// and so on; in the lossy encoding as SPEC.md describes under "Bounded".
     shuffled: Vec<u8>,
     /// Values of the last decoded frame (the frame before `next`), and of the frame before that: as [`ordered`]
-    /// integers in the lossless encoding, as multiples of the step in the lossy one.
+    /// integers in the lossless encoding, as multiples of the quantization step in the lossy one.
     recent: [Vec<u32>; 2],
     next: usize,
     bounded: bool,
@@ -219,7 +222,7 @@ pub(crate) struct StoredTile<'a> {
     pub(crate) frames: usize,
     /// Number of values per frame.
     pub(crate) plane: usize,
-    /// Error bound of the tile's column; 0 if its values are exact.
+    /// Maximum absolute error of the values of the tile; 0 if they are exact.
     pub(crate) max_error: f64,
 }
 
@@ -364,8 +367,8 @@ fn unordered(rank: u32) -> u32 {
     rank ^ (!((rank as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// Zigzag code: maps a signed difference to an unsigned integer, so that small differences of either sign have high
-/// bytes of zero.
+/// Returns the zigzag code of a signed difference: an unsigned integer whose high bytes are zero if the difference is
+/// small, positive or negative.
 pub(crate) fn zigzag(difference: u32) -> u32 {
     (difference << 1) ^ ((difference as i32) >> 31) as u32
 }
@@ -375,8 +378,8 @@ fn unzigzag(code: u32) -> u32 {
     (code >> 1) ^ (code & 1).wrapping_neg()
 }
 
-/// Predicts a value from the two frames before it: order 1 repeats `before`, order 2 continues the line through both.
-/// Values are [`ordered`] integers or multiples of a step.
+/// Predicts a value from its values `before` and `second_before` in the two frames before: order 1 repeats `before`,
+/// order 2 continues the line through both. Values are [`ordered`] integers, or multiples of the quantization step.
 pub(crate) fn predict(order: u8, before: u32, second_before: u32) -> u32 {
     match order {
         1 => before,

@@ -18,7 +18,7 @@ use memmap2::Mmap;
 
 use crate::error::{Error, Fault, Result};
 
-/// Number of bytes read at a time from a long range; a multiple of the length of a record (64).
+/// Number of bytes that one system call reads from a long range of a file; a multiple of 64, the length of a record.
 pub(crate) const CHUNK_BYTES: usize = 1 << 16;
 
 /// Number of bytes around a page that the operating system may map together with it when it is first read (Linux:

@@ -15,13 +15,14 @@ use crate::error::{Error, Fault, Result, quoted};
 pub const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
 /// Format versions that this crate writes: 1 if no column has an error bound, 2 if one has.
 pub(crate) const VERSIONS: [u32; 2] = [1, 2];
-/// Length in bytes of the header before the first column: magic, version, header length, number of Gaussians, the two
-/// block lengths, and the numbers of columns and attributes.
+/// Length in bytes of the part of the file header before the first column: magic, version, header length, number of
+/// Gaussians, the two block lengths, and the numbers of columns and attributes.
 pub(crate) const FIXED_HEADER_BYTES: usize = 40;
 
 /// Maximum decoded size of one tile, in bytes (256 MiB). A reader never allocates more for a tile.
 pub const MAX_TILE_BYTES: u64 = 1 << 28;
-/// Maximum length of a header, in bytes. It limits what a reader allocates for a forged header length.
+/// Maximum length of a file header, in bytes. A reader therefore never allocates more than this for a forged header
+/// length.
 pub(crate) const MAX_HEADER_BYTES: usize = 1 << 22;
 const MAX_GAUSSIANS: u64 = 1 << 32;
 const MAX_FRAME_BLOCK: u32 = 1 << 24;
@@ -58,7 +59,8 @@ pub struct Layout {
     pub frame_block: u32,
     /// Columns of the container, 1 to 256. A full tile of the widest column must fit [`MAX_TILE_BYTES`].
     pub columns: Vec<ColumnSpec>,
-    /// Free text by key: at most 1024 keys of at most 256 bytes, values of at most 1 MiB each, 4 MiB in total.
+    /// Text attributes that the writer of the container chooses, by key: at most 1024 keys of at most 256 bytes, values
+    /// of at most 1 MiB each, 4 MiB in total.
     pub attributes: BTreeMap<String, String>,
 }
 

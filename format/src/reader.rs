@@ -61,7 +61,7 @@ pub struct TileBuffer {
 pub struct TileReadCounts {
     /// Number of bytes of stored tile data that were read from the file.
     pub bytes: u64,
-    /// Number of tiles that were decoded or, if they are raw (plain f32), loaded.
+    /// Number of tiles that were decoded. A raw tile (plain f32) counts when it is loaded.
     pub tiles: u64,
 }
 
@@ -78,7 +78,7 @@ pub struct Tile<'a> {
 /// Entry in the index (table of tiles) of a container for one tile: one column for a block of Gaussians and frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileInfo {
-    /// Encoding of the tile's values in its stored bytes.
+    /// Encoding (raw, lossless or lossy) of the values of the tile in its stored bytes.
     pub encoding: Encoding,
     /// Whether all frames of the tile are equal, so that only one is stored.
     pub constant: bool,
@@ -90,7 +90,7 @@ pub struct TileInfo {
     pub stored_bytes: u64,
     /// Checksum (xxh3-64) of the tile's stored bytes.
     pub checksum: u64,
-    /// Minimum, maximum and number of non-finite values of the tile.
+    /// Minimum, maximum and number of non-finite values among the values of the tile.
     pub stats: TileStats,
 }
 
@@ -449,8 +449,9 @@ fn read_stored(file: &MappedFile, tile: &TileRecord, stored: &mut Vec<u8>) -> Re
     check_payload(tile, xxh3_64(stored)).map_err(|fault| fault.at(file.path()))
 }
 
-/// Decompresses the tile with the index entry `tile`, which is not raw, from its stored bytes `stored` into the decoder
-/// `frames`, which can then decode its frames. Creates the decompressor `zstd` if it is `None`.
+/// Decompresses a tile that is not raw into the decoder `frames`, which can then decode the frames of the tile one by
+/// one. `tile` is the index entry of the tile, and `stored` its stored bytes. Creates the decompressor `zstd` if it is
+/// `None`.
 fn decompress(
     file: &MappedFile,
     layout: &Layout,

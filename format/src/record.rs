@@ -10,15 +10,15 @@ use crate::codec::{Encoding, TileStats};
 use crate::error::Fault;
 use crate::layout::{Layout, TileId};
 
-/// Length in bytes of a record header. Records start at multiples of this length, so payloads are 64-byte aligned in
-/// the file and in its memory map.
+/// Length in bytes of a record header: the description of a tile, of time stamps or of the footer. Records start at
+/// multiples of this length, so payloads are 64-byte aligned in the file and in its memory map.
 pub(crate) const RECORD_BYTES: u64 = 64;
-/// Length in bytes of the trailer, which ends a finished file.
+/// Length in bytes of the trailer, which ends a finished container and states where its footer lies.
 pub(crate) const TRAILER_BYTES: u64 = 32;
 /// Last bytes of every finished container.
 const END_MAGIC: [u8; 8] = *b"\x1aGSEQEND";
 
-/// Rounds `offset` up to the next offset at which a record may start.
+/// Rounds the file offset `offset` up to the next multiple of 64 bytes, at which a record may start.
 pub(crate) fn align(offset: u64) -> u64 {
     offset.next_multiple_of(RECORD_BYTES)
 }
@@ -39,7 +39,7 @@ pub(crate) struct TileRecord {
     pub(crate) stats: TileStats,
 }
 
-/// Record whose payload contains the time stamps of one frame block.
+/// Header of the record whose payload contains the time stamps of one frame block.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TimesRecord {
     pub(crate) frame_block: u32,
@@ -47,7 +47,7 @@ pub(crate) struct TimesRecord {
     pub(crate) checksum: u64,
 }
 
-/// Record whose payload contains all time stamps and the index of all tiles.
+/// Header of the footer, the record whose payload contains all time stamps and the index (table of tiles).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct FooterRecord {
     pub(crate) frames: u64,
@@ -83,7 +83,7 @@ impl FooterRecord {
 }
 
 impl Record {
-    /// Encodes the record header, including its checksum.
+    /// Encodes the 64-byte header of the record, including its checksum.
     pub(crate) fn to_bytes(self) -> [u8; RECORD_BYTES as usize] {
         let mut out = [0; RECORD_BYTES as usize];
         match self {
@@ -225,14 +225,18 @@ impl TileRecord {
         Ok(())
     }
 
-    /// Returns whether two tiles may share their stored bytes. They may if both are constant, of the same column and
-    /// Gaussian block, and have equal records except for the frame block and the number of frames.
+    /// Returns whether the tile of another record, `other`, may share its stored bytes with the tile of this record.
+    /// Three conditions must hold:
+    /// - Both tiles are constant (all frames equal).
+    /// - They belong to the same column and Gaussian block.
+    /// - All other fields of the records are equal, except for the frame block and the number of frames.
     pub(crate) fn may_share(&self, other: &TileRecord) -> bool {
         let shared = |tile: &TileRecord| TileRecord { id: TileId { frame_block: 0, ..tile.id }, frames: 0, ..*tile };
         self.constant && shared(self).same_bits(&shared(other))
     }
 
-    /// Returns whether two records have the same bytes when encoded, so that NaN and −0 are compared as bits.
+    /// Returns whether the records of two tiles have the same bytes when encoded. Numbers are thus compared as bits:
+    /// NaN equals a NaN of the same bits, and −0 differs from +0.
     fn same_bits(&self, other: &TileRecord) -> bool {
         Record::Tile(*self).to_bytes() == Record::Tile(*other).to_bytes()
     }
@@ -275,7 +279,8 @@ impl Digest {
         Digest(hash)
     }
 
-    /// Adds the record of the next tile to the hash. Tiles must be added in the order of the index.
+    /// Adds the record (64-byte description) of the next tile to the hash. Tiles must be added in the order of the
+    /// index, the table of tiles.
     pub(crate) fn tile(&mut self, tile: &TileRecord) {
         self.0.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
     }

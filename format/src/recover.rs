@@ -27,7 +27,8 @@ pub struct RecoverReport {
     /// Number of tiles in the new container. The other intact tiles belong to an incomplete frame block or to a frame
     /// block after an incomplete one.
     pub tiles_saved: u64,
-    /// Number of bytes of the damaged file that belong to no intact record.
+    /// Number of bytes of the damaged file that were skipped, because they belong to no intact tile, time stamps or
+    /// footer.
     pub bytes_skipped: u64,
 }
 
@@ -108,7 +109,7 @@ struct FoundRecords {
     /// may share. The key is the offset of these bytes.
     constants: HashMap<u64, TileRecord>,
     skipped: u64,
-    /// Number of bytes of all time stamps found (8 per frame).
+    /// Number of bytes of all time stamps found in the damaged file (8 per frame).
     time_bytes: u64,
 }
 
@@ -159,8 +160,8 @@ fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<F
 }
 
 impl FoundRecords {
-    /// Returns the bytes of memory that the records found so far take, including the growth of their lists, plus those
-    /// for decoding the largest tile.
+    /// Returns the bytes of memory that recovery needs for what it has found so far: the lists of records with room for
+    /// their growth, and buffers to decode the largest tile.
     fn bytes(&self, layout: &Layout) -> u64 {
         let tiles = (self.tiles.capacity() + self.constants.capacity()) * 3 / 2 * (size_of::<TileRecord>() + 16);
         let times = 2 * self.time_bytes + 64 * self.times.len() as u64;
@@ -198,8 +199,8 @@ impl FoundRecords {
     }
 }
 
-/// Reads the time stamps after the record `times`, which is at byte `position` of the file. Checks them against the
-/// record's checksum and the layout.
+/// Reads the time stamps that follow the record `times` (a 64-byte header), which is at byte `position` of the file.
+/// Checks them against the checksum in this record and against the layout.
 pub(crate) fn read_times(file: &MappedFile, layout: &Layout, times: &TimesRecord, position: u64) -> Result<Vec<f64>> {
     let fault = |fault: Fault| fault.at(file.path());
     if !(1..=layout.frame_block).contains(&times.frames) {

@@ -8,8 +8,8 @@ use crate::error::{Error, Result};
 use crate::layout::TileId;
 use crate::record::{RECORD_BYTES, Record, TileRecord};
 
-/// Length in bytes of the fields before the stored bytes of a serialized tile: a record with offset 0, then width,
-/// number of Gaussians, and error bound.
+/// Length in bytes of the fields that precede the stored bytes in a serialized tile: a tile record (64 bytes, with
+/// offset 0), then width, number of Gaussians, and error bound.
 const HEAD_BYTES: usize = RECORD_BYTES as usize + 16;
 
 impl EncodedTile {

@@ -16,9 +16,10 @@ pub struct VerifyReport {
     pub frames: u64,
     /// Number of tiles of the container.
     pub tiles: u64,
-    /// Number of stored bytes of all tiles; bytes that several tiles share count once.
+    /// Number of bytes in which all tiles are stored, mostly compressed. Bytes that several tiles share count once.
     pub stored_bytes: u64,
-    /// Number of bytes of decoded values. A constant tile (all frames equal) counts one frame; shared tiles count once.
+    /// Number of bytes of the decoded values of all tiles. A constant tile (all frames equal) counts as one frame.
+    /// Tiles that share their stored bytes count once.
     pub decoded_bytes: u64,
 }
 
@@ -128,8 +129,8 @@ impl Reader {
     }
 }
 
-/// Checks that the statistics in the record `tile` match `values`, the values of the tile. The record is at byte
-/// `position` of the file.
+/// Checks that the statistics in the record `tile` (the 64-byte description of a tile) match `values`, the values of
+/// the tile. The record is at byte `position` of the file.
 pub(crate) fn check_stats(tile: &TileRecord, position: u64, values: &[f32]) -> std::result::Result<(), Fault> {
     let found = stats(bytemuck::cast_slice(values));
     // Bits are compared: a forged NaN must not pass, and −0 must not pass for +0.

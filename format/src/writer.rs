@@ -38,12 +38,14 @@ pub struct Writer {
     file: File,
     layout: Layout,
     header: Vec<u8>,
-    /// Offset in the file at which the next record is written; a multiple of 64.
+    /// Offset in the file at which the next record (of time stamps, of a tile or of the footer) is written; a multiple
+    /// of 64.
     position: u64,
     times: Vec<f64>,
-    /// Unnamed temporary file that contains the record of tile i at byte 64·i, or zeros if the tile is not written yet.
+    /// Unnamed temporary file that contains the index (table of tiles): the 64-byte record of tile i at byte 64·i, or
+    /// zeros if the tile is not written yet.
     index: File,
-    /// Number of tiles in the frame blocks appended so far, written or not.
+    /// Number of all tiles, written or not, of the frame blocks whose time stamps have been appended so far.
     tiles: u64,
     /// Number of tiles written so far.
     written: u64,

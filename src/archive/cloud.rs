@@ -346,7 +346,8 @@ impl CurveDistances {
 /// Coder of planes (scalar components of all Gaussians): the state that it carries from one plane to the next.
 #[derive(Clone)]
 struct PlaneCoder {
-    /// Values of the two planes coded before, the last one first: one value per Gaussian, less the mean of its plane.
+    /// Values of the two planes (scalar components of all Gaussians) coded last, the most recent one first: one value
+    /// per Gaussian, less the mean of its plane.
     known: [Vec<f32>; 2],
     /// Moving average of the absolute prediction errors of each Gaussian over the planes, in quantization steps.
     sizes: Vec<f32>,
@@ -362,11 +363,17 @@ impl PlaneCoder {
         PlaneCoder { known: [none(), none()], sizes: none(), group: usize::MAX, models: Residuals::new() }
     }
 
-    /// Visits every Gaussian of one plane (scalar component of all Gaussians) in coding order. `group`, `grid` and
-    /// `mean` are [`Plane::group`], quantization grid and mean (in steps) of this plane. Calls `code` to encode or
-    /// decode each value, with four arguments: the index of the Gaussian, the known values to predict from, the
-    /// expected absolute prediction error in quantization steps, and the entropy models. `code` returns two numbers in
-    /// steps: the quantized value, and the prediction error (quantized less predicted value).
+    /// Codes one plane (scalar component of all Gaussians): calls `code` once for each Gaussian, in coding order.
+    ///
+    /// The plane:
+    /// - `group`: [`Plane::group`]; planes of one group share the entropy models.
+    /// - `grid`: quantization grid of the values.
+    /// - `mean`: mean of the values, in quantization steps.
+    ///
+    /// `code` encodes or decodes one value:
+    /// - Arguments: index of the Gaussian, known values to predict from, expected absolute prediction error in
+    ///   quantization steps, entropy models.
+    /// - Results: quantized value, and prediction error (quantized less predicted value), both in quantization steps.
     #[inline(always)]
     fn plane(
         &mut self,

@@ -74,8 +74,9 @@ impl SymbolModel {
         (start, end - start)
     }
 
-    /// Updates the probabilities after `symbol` was coded: moves them toward those of a model that is certain of
-    /// `symbol`. Every probability stays at least `MIN_PROBABILITY`, because it is so in both models.
+    /// Updates the model after `symbol` was coded: moves the probabilities toward those of a model that is certain of
+    /// `symbol`. Every probability stays at least `MIN_PROBABILITY`, because it is at least that large before the
+    /// update and in the certain model.
     fn learn(&mut self, symbol: usize) {
         let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
         self.seen = self.seen.saturating_add(1);
@@ -105,7 +106,8 @@ impl BitModel {
         if bit { (zero, (1 << PRECISION) - zero) } else { (0, zero) }
     }
 
-    /// Updates the probability after `bit` was coded. Both probabilities stay at least [`MIN_BIT_PROBABILITY`].
+    /// Updates the model after `bit` was coded: raises the probability of `bit`. The probabilities of 0 and of 1 both
+    /// stay at least [`MIN_BIT_PROBABILITY`].
     fn learn(&mut self, bit: bool) {
         let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
         self.seen = self.seen.saturating_add(1);

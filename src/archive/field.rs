@@ -59,8 +59,8 @@ pub(super) struct TensorEntry {
     /// - other tensor of weights: one per element
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
-    /// Mean of the texels that the deformation field reads, in quantization steps, for a feature plane; 0 for other
-    /// tensors.
+    /// For a feature plane: mean of the texels (grid elements) that the deformation field reads, in quantization steps.
+    /// For other tensors: 0.
     pub(super) mean: i64,
     /// Weights with which a value is predicted from its neighbors in the tensor (predictor weights).
     #[serde(rename = "parts")]
@@ -327,8 +327,10 @@ pub(super) fn decode(
 
 /// Returns `tensor`, whose role is `role`, as an archive would restore it: rounded to the quantization grids of
 /// `steps`. `position` holds the canonical positions of the Gaussians; `space` is the box of space that the feature
-/// planes cover. One difference from an archive: in a plane over time, every row is rounded by itself, even for times
-/// that no frame has.
+/// planes cover.
+///
+/// Planes over time differ from those of an archive: here every row keeps its own rounded values. An archive stores
+/// only the rows that frame times read, and restores the other rows as copies of these.
 pub fn round_tensor(
     tensor: &Tensor,
     role: TensorRole,

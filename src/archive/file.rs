@@ -57,7 +57,8 @@ pub struct ArchiveSize {
     pub cloud: u64,
     /// Number of bytes that the deformation field takes.
     pub field: u64,
-    /// Number of bytes of everything else: header, table of contents, and bytes without entropy coding (`blobs`).
+    /// Number of bytes that hold neither Gaussians nor deformation field: header, table of contents, and bytes without
+    /// entropy coding (`blobs`).
     pub rest: u64,
 }
 

@@ -13,9 +13,9 @@ use super::field::TensorRole;
 use crate::deform::{Box3, Tensor, Tensors, TexelPair, texel_pair};
 use crate::model::AttributeValues;
 
-/// Maximum number of Gaussians at whose positions the deformation field is sampled.
+/// Maximum number of Gaussians at whose positions the deformation field is evaluated to estimate the effect of errors.
 const GAUSSIANS: usize = 256;
-/// Number of times at which the field is sampled for each sampled Gaussian.
+/// Number of points in time at which the deformation field is evaluated for each sampled Gaussian.
 const TIMES: usize = 4;
 /// Step between possible offsets of quantization steps, in eighths of an octave. Offsets are multiples of 4 eighths,
 /// that is, of half an octave (a factor of √2).

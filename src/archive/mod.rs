@@ -200,7 +200,8 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
 }
 
 /// Decodes the contents of the archive sections `sections`, whose table of contents `table` has been checked. Returns
-/// the content, and `parts` (its size by purpose) unchanged. Fails if the sections do not match the table.
+/// the content, together with the argument `parts`, the size of the archive by purpose. Fails if the sections do not
+/// match the table.
 fn decoded(
     sections: Sections,
     table: Table,

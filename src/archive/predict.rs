@@ -27,9 +27,11 @@ pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], difference
 /// values less their means).
 #[derive(Debug)]
 pub(super) struct PredictorFit<const N: usize> {
-    /// For each pair of differences, the sum of their products over all samples (lower triangle).
+    /// For each pair of differences (known neighboring values less their means), the sum of their products over all
+    /// samples (lower triangle).
     products: [[f64; N]; N],
-    /// For each difference, the sum over all samples of its product with the value to predict.
+    /// For each difference (known neighboring value less its mean), the sum over all samples of its product with the
+    /// value to predict.
     with_value: [f64; N],
 }
 

@@ -26,7 +26,8 @@ pub(super) struct QuantizedTensor<'a> {
     /// Class of every place (row and column), which selects the quantization grid. Either `[rows, columns]`, or
     /// `[columns]` if all rows have the same classes. All channels have the same classes.
     pub(super) classes: &'a [u8],
-    /// Function that returns a quantization grid, given the index of a channel and the class of a place in it.
+    /// Function that returns a quantization grid, given the index of a channel and the class of a place (row and
+    /// column).
     pub(super) grids: &'a dyn Fn(usize, u8) -> QuantizationGrid,
     /// Number of classes that select a quantization grid. [`UNREAD`] is not counted.
     pub(super) class_count: usize,
@@ -115,15 +116,15 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Computes a new value for every place (row and column) of every channel, in coding order, and writes it to
-    /// `data`. There are three cases:
-    /// - The field reads the place. The value is the restored value that `code` returns.
-    /// - The place is in a stored row, but the field never reads it. The value is the mean of four known neighbors:
-    ///   left, above, above left and above right.
-    /// - The place is in a row that is not stored. The value is that of the same column in the nearest stored row.
+    /// Replaces every value of `data` by the value that a decoder restores. Goes through the channels in order, and
+    /// through the places (row and column) of a channel row by row. There are three kinds of places:
+    /// - Places that the deformation field reads: the new value is the one that `code` returns.
+    /// - Places in a stored row that the field never reads: the new value is the mean of the new values at four
+    ///   neighbors (left, above, above left and above right).
+    /// - Places in a row that is not stored: the new value is that of the same column in the nearest stored row.
     ///
     /// `code` encodes or decodes one value:
-    /// - Arguments: index of the place in its channel, present value in `data`, known neighbors, quantization grid.
+    /// - Arguments: index of the place in its channel, old value in `data`, known neighbors, quantization grid.
     /// - Results: restored value, and absolute prediction error in quantization steps. Later places are predicted from
     ///   the restored value. The error serves to estimate the errors of these predictions.
     #[inline(always)]

@@ -29,21 +29,24 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
     (128, 0),
 ];
 
-/// Number of entropy models for the class of an error's magnitude. Each is used for one range of expected error sizes.
-/// Two ranges make up an octave (a factor of 2); the first range begins at a quarter of a quantization step.
+/// Number of entropy models for the magnitude class of a prediction error (index in [`CLASSES`]). Each is used for one
+/// range of expected error sizes. Two ranges make up an octave (a factor of 2); the first range begins at a quarter of
+/// a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Number of entropy models for the sign of an error, for each distance of the predicted value from the grid
-/// ([`PredictedMultiple::offset`]). Errors of magnitude 1, 2 and 3 have one model each, all larger errors share one.
+/// Number of entropy models for the sign of a prediction error, for each distance of the predicted value from the
+/// quantization grid ([`PredictedMultiple::offset`]). Errors of magnitude 1, 2 and 3 have one model each, all larger
+/// errors share one.
 const SIGN_CONTEXTS: usize = 4;
 
 /// Entropy models of prediction errors. Similar planes or tensors share them.
 #[derive(Debug, Clone)]
 pub(super) struct Residuals {
-    /// Entropy model of the class of an error's magnitude, for each range of the expected error size.
+    /// Entropy models of the magnitude class of a prediction error (index in [`CLASSES`]), one for each range of the
+    /// expected error size.
     classes: [SymbolModel; CONTEXTS],
-    /// Entropy models of the sign of an error. First index: distance of the predicted value from the grid
-    /// ([`PredictedMultiple::offset`]). Second index: class of the magnitude less 1, at most 3.
+    /// Entropy models of the sign of a prediction error. First index: distance of the predicted value from the
+    /// quantization grid ([`PredictedMultiple::offset`]). Second index: magnitude class of the error less 1, at most 3.
     signs: [[BitModel; SIGN_CONTEXTS]; OFFSETS],
 }
 

@@ -83,7 +83,7 @@ impl QuantizationGrid {
         rounded(self.clamped(value))
     }
 
-    /// Returns `value` in units of the step, limited to [`MAX_MULTIPLE`] in magnitude.
+    /// Returns `value` in units of the quantization step, limited to [`MAX_MULTIPLE`] in magnitude.
     #[inline(always)]
     fn clamped(self, value: f64) -> f64 {
         (value * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE)

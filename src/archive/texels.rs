@@ -8,8 +8,9 @@ use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, texel_pair};
 use crate::model::AttributeValues;
 
-/// Smallest octave of a texel that has a class of its own; texels of smaller octaves belong to class 0 too. The octave
-/// of a texel is log2, rounded down, of its squared interpolation weights, summed over the Gaussians that read it.
+/// Octave of class 0, the lowest class of texels (grid elements of a feature plane). Texels of lower octaves belong to
+/// class 0 too. The octave of a texel is log2, rounded down, of the sum of its squared interpolation weights over the
+/// Gaussians that read it.
 const MIN_EXPONENT: i32 = -8;
 /// Number of classes of texels. A class is a number that selects a texel's quantization grid. Texels belong to the same
 /// class if their squared interpolation weights, summed over the Gaussians that read them, lie in the same octave.

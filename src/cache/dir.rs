@@ -20,7 +20,8 @@ use crate::files::atomic::remove_leftovers;
 #[derive(Debug)]
 pub(super) struct CacheDir {
     folder: PathBuf,
-    /// Key on which all keys of this run depend, such as the key of the input.
+    /// Cache key of what all results of this run depend on, such as the input. The key of every cache entry includes
+    /// it.
     context: CacheKey,
     about: String,
 }

@@ -130,8 +130,8 @@ impl Cache {
 
     /// Returns the result of `stage` for `key` if it is stored. If it is not, computes it with `compute` and stores it.
     ///
-    /// `stage` cannot be divided into shards (parts). A run that is limited to one shard nevertheless computes the
-    /// whole stage. If it must end before the stage instead, `compute` begins with a call of
+    /// For a stage that is not divided into shards (parts). A run that is limited to one shard also computes the whole
+    /// stage. If such a run must end before this stage, let `compute` begin with a call of
     /// [`Cache::end_shard_run_before`].
     ///
     /// # Errors
@@ -235,9 +235,8 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`, except in a run that is limited to shard 1 of 1 (a single part,
-    /// which is the whole stage). Such a run ends when its shard is done, so the function then fails with
-    /// [`Error::ShardDone`].
+    /// Returns `whole`, the full result of `stage`. Only in a run that is limited to shard 1 of 1 (the whole stage as a
+    /// single part), fails with [`Error::ShardDone`] instead: such a run ends when this stage is done.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -247,23 +246,20 @@ impl Cache {
         }
     }
 
-    /// Returns the number n of shards (parts) into which `stage` is divided; 1 means that it is not divided. To be
-    /// called if the full result of `stage` is not stored. The caller then computes the shards that are not stored, and
-    /// joins all n.
+    /// Chooses into how many shards (parts) `stage` is divided, and returns this number n; 1 means that it is not
+    /// divided. The caller then computes the shards that are not stored, and joins all n. To be called only if the full
+    /// result of `stage` is not stored.
     ///
-    /// If the run is limited to one of several shards, this function computes and stores that shard, and returns an
-    /// error instead of n (rule 5).
-    ///
-    /// The work folder may hold shards of several divisions, which differ in the number of shards. The first of these
-    /// rules that applies decides:
+    /// The work folder may hold shards from several runs that divided the stage into different numbers of shards. The
+    /// first case that applies decides:
     /// 1. There is no work folder: n is 1.
-    /// 2. All shards of a division are stored: n is the number of its shards.
-    /// 3. The run is not limited to a shard: n is the number of shards of the division of which the largest fraction is
-    ///    stored. If no shard is stored, n is 1.
+    /// 2. All shards of a division into m shards are stored: n is m.
+    /// 3. The run is not limited to one shard: n is the number of shards of the division of which the largest fraction
+    ///    is stored. If no shard is stored, n is 1.
     /// 4. The run is limited to shard 1 of 1: n is 1.
-    /// 5. The run is limited to one of several shards. If `find` does not find this shard stored, `make` computes and
-    ///    stores it. The error [`Error::ShardDone`] is returned in both cases. It ends the run as intended and reports
-    ///    which shards are missing.
+    /// 5. The run is limited to one of several shards: returns no n. If `find` does not find the stored shard, `make`
+    ///    computes and stores it. In both cases the run then ends as intended, with the error [`Error::ShardDone`],
+    ///    which reports the missing shards.
     fn divide<T>(
         &self,
         stage: &str,

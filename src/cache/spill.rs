@@ -12,7 +12,7 @@ use crate::cache::entry::EntryWriter;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, StagedFile};
 
-/// Number of bytes that this process has read back from all [`Spill`]s so far.
+/// Number of bytes that this process has read back so far from all [`Spill`]s (data moved from memory to files).
 static READ_BACK: AtomicU64 = AtomicU64::new(0);
 
 /// Data that was moved from memory to a file. Any range of its bytes can be read, in any order.
@@ -62,7 +62,8 @@ impl Spill {
         Ok(start + 8 + length)
     }
 
-    /// Returns the number of bytes that this process has read back from all spills so far.
+    /// Returns the number of bytes that this process has read back so far from all spills (data that it moved from
+    /// memory to files).
     pub fn bytes_read_back() -> u64 {
         READ_BACK.load(Ordering::Relaxed)
     }

@@ -29,8 +29,9 @@ const MIN_BAR_COLUMNS: usize = 8;
 
 /// Receiver of the library's events, which displays them on standard error.
 pub(super) struct Display {
-    /// Whether to hide progress, and messages about a result that a stage computed but the run does not use
-    /// ([`Message::Discarded`]). Plans are always shown, because the user requests them. Warnings are always shown too.
+    /// Whether to hide progress, and messages that the result of a stage is not used ([`Message::Discarded`]). Warnings
+    /// are always shown. Memory plans and time forecasts ([`Message::Plan`]) too, because they are sent only on
+    /// request.
     is_quiet: bool,
     shared: Arc<Shared>,
 }
@@ -42,7 +43,7 @@ struct Shared {
     bars: MultiProgress,
     /// Number of tasks that are running and whose progress is written as log lines, not shown as a bar.
     logs: AtomicUsize,
-    /// Stages, start and running stage of the current run; `None` outside a run.
+    /// Stages, start and running stage of the compression that is running; `None` if none is running.
     run: Mutex<Option<RunPosition>>,
 }
 
@@ -150,7 +151,7 @@ impl Drop for Bar {
     }
 }
 
-/// Progress of a run: its stages, its start, and the stage that is running.
+/// Progress of a run (one compression): its stages, its start, and the stage that is running.
 #[derive(Debug)]
 struct RunPosition {
     /// Name and expected duration, in seconds, of each stage.
@@ -172,11 +173,13 @@ impl RunPosition {
     }
 
     /// Returns the estimated time from `now` until the end of the run, seconds. `step`: estimated time until the end of
-    /// the running stage, computed from its own progress, seconds.
-    /// - Before the first stage, returns `step`.
-    /// - Later, returns the time left of the running stage, but at least `step`, plus the expected times of all later
-    ///   stages. The expected times are multiplied by the ratio of actual to expected time of the finished stages,
-    ///   limited to 0.1 to 10. If less than half a second was expected for the finished stages, the ratio is not used.
+    /// the running stage, extrapolated from the speed of its progress bar, seconds; 0 if unknown.
+    /// - Before the first stage, the result is `step`.
+    /// - Later, the result is the sum of two times: the time left of the running stage, and the expected times of all
+    ///   later stages. The time left of the running stage is its expected time minus its elapsed time, but at least
+    ///   `step`.
+    /// - Expected times are first multiplied by a correction: the ratio of actual to expected time of all finished
+    ///   stages, limited to 0.1 to 10. The correction is 1 if their expected time is below half a second.
     fn left(&self, step: f64, now: Instant) -> f64 {
         let Some((place, since)) = self.current else { return step };
         let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
@@ -200,7 +203,7 @@ struct BarSnapshot<'a> {
     per_second: f64,
     /// Estimated seconds left of the task; `None` if unknown.
     left: Option<f64>,
-    /// Estimated seconds left of the run; `None` if unknown.
+    /// Estimated seconds until the end of the whole run to which the task belongs; `None` for a task outside a run.
     run: Option<f64>,
 }
 

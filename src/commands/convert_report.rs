@@ -29,7 +29,8 @@ pub struct ConvertReport {
 }
 
 impl ConvertReport {
-    /// Returns one line for the terminal, and a second one if the output is larger than the input.
+    /// Returns the result as a line of text for the terminal: path, numbers of Gaussians and frames, bytes. If the
+    /// output is larger than the input, adds a second line with the reason.
     pub fn text(&self) -> String {
         let frames = self.frames.map_or(String::new(), |frames| format!(" x {frames} frames"));
         let larger = self.larger.as_ref().map_or(String::new(), |why| format!("  {why}\n"));

@@ -124,8 +124,8 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
 }
 
 /// Removes the times from the shots (pairs of a camera and a time) of `opened`, so that every camera can show every
-/// frame. Returns a copy of the shots with their times. Does nothing and returns `None` if there are no cameras, or if
-/// `has_other_frames` is false: the frames are then at the times of the cameras.
+/// frame. Returns a copy of the shots with their times. `has_other_frames`: whether the user requested frames at other
+/// times than those of the cameras. If not, or if there are no cameras, changes nothing and returns `None`.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();

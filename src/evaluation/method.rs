@@ -123,7 +123,7 @@ pub(crate) enum MethodKind {
 pub(crate) const STEPS: &str = "refine_steps";
 
 /// Returns the method that compresses by the preset `default` with `steps` optimization steps of refinement. The number
-/// of steps before each prune step changes in proportion to `steps`.
+/// of steps before each prune step (removal of the lowest-ranked Gaussians) changes in proportion to `steps`.
 pub(crate) fn refining_by(steps: u32) -> Result<MethodKind> {
     Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.with_refinement_steps(steps)), PruneOrMerge::Both))
 }

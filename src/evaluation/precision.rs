@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use crate::evaluation::cost::{Cost, MedianAndRange};
 use crate::files::csv::{optional_field, table};
 
-/// Result of the command `precision`: measurements of all varied settings, and the conditions that they share.
+/// Result of the command `precision`: errors, run time and memory of the program for several values of each parameter,
+/// and the conditions (such as input and cameras) that are the same for all these measurements.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionDiagram {
     /// Name and version of the program.
@@ -40,7 +41,8 @@ pub struct PrecisionDiagram {
     /// Maximum number of runs of each setting. There are fewer if the total time of its runs reaches
     /// [`PrecisionDiagram::max_setting_seconds`].
     pub runs: usize,
-    /// Total time in seconds of the runs of one setting after which this setting is not run again.
+    /// Limit on the time spent on one setting, in seconds. Once all runs of a setting together take this time, it is
+    /// not run again.
     #[serde(rename = "enough")]
     pub max_setting_seconds: f64,
     /// Results of the varied knobs (parameters, or groups of parameters).
@@ -49,7 +51,7 @@ pub struct PrecisionDiagram {
     pub notes: Vec<String>,
 }
 
-/// Origin of an error.
+/// Cause of the errors that the command `precision` measures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ErrorSource {
@@ -102,9 +104,9 @@ pub struct PrecisionCurve {
     /// Value that the recipe has for the parameter; `None` if this value was not measured.
     #[serde(rename = "own")]
     pub recipe_value: Option<f64>,
-    /// Coarsest sufficient value of the parameter; `None` if no value is sufficient. From a sufficient value on, up to
-    /// the finest value, the error added to renders stays below a tenth of the error of the compressed model itself.
-    /// The finest value does not count, because the errors are measured against it.
+    /// Coarsest value of the parameter that is accurate enough; `None` if there is none. A value is accurate enough if,
+    /// at this value and at all finer values, the error that it adds to renders is below a tenth of the error of the
+    /// compressed model itself. The finest value does not count, because the errors are measured against it.
     #[serde(rename = "enough")]
     pub sufficient_value: Option<f64>,
 }
@@ -112,7 +114,7 @@ pub struct PrecisionCurve {
 /// Measurements with one setting, that is, at one value of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionSetting {
-    /// Value of the varied parameter.
+    /// Value of the parameter that the command `precision` varies.
     pub value: f64,
     /// Step size h that belongs to this value: an error of order p is proportional to h^p. For sums over frames, h is
     /// the number of frames, because rounding errors grow with it.
@@ -141,9 +143,9 @@ pub struct ObservedOrder {
 /// Name of the error: root mean square error of renders of the model that a setting yields, compared with renders of
 /// the whole model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
-/// Name of the error √(e² − f²) / f. Here e is the error [`RENDER_ERROR`] of a setting, and f is that of the finest
-/// setting, which counts as the error of the compressed model itself. This is the error that the setting adds (see
-/// [`added_error`]).
+/// Name of the error that a setting adds to renders: √(e² − f²) / f (see [`added_error`]). Here e is the error
+/// [`RENDER_ERROR`] of the setting, and f is the error [`RENDER_ERROR`] of the finest setting, which counts as the
+/// error of the compressed model itself.
 pub const ADDED_ERROR: &str = "added";
 /// Name of the error: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest
 /// setting keeps.

@@ -120,7 +120,8 @@ pub struct TruthComparison {
     /// Mean scores of the compressed model against the photographs.
     #[serde(flatten)]
     pub compressed: Comparison,
-    /// Mean scores of the original model against the photographs, the reference for the scores of the compressed model.
+    /// Mean scores of the original model against the photographs, for comparison with the scores of the compressed
+    /// model.
     pub original: Comparison,
 }
 

@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::files::csv::{optional_field, table};
 
-/// Result of the command `sweep`: measurements of all methods, and the conditions that they share.
+/// Result of the command `sweep`: size, quality, time and memory of every compression method, and the conditions (such
+/// as input and cameras) that are the same for all these measurements.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TradeOff {
     /// Name and version of the program.
@@ -72,7 +73,7 @@ pub struct EffortCurve {
 /// Measurements at one value of the parameter of an [`EffortCurve`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EffortSetting {
-    /// Value of the varied parameter.
+    /// Value of the recipe parameter that the curve varies.
     pub value: u32,
     /// Method, fraction of kept Gaussians, and measurements with this value of the parameter.
     #[serde(flatten)]

@@ -141,7 +141,7 @@ impl ValueType {
 pub(crate) struct TensorView {
     /// Node of the object tree that builds the tensor. For a parameter, the node of the tensor inside it.
     pub(crate) id: NodeId,
-    /// Key of the storage that holds the values.
+    /// Key of the storage (block of tensor values) that holds the values of this tensor.
     pub(crate) storage: String,
     pub(crate) kind: ValueType,
     pub(crate) shape: Vec<usize>,
@@ -473,7 +473,7 @@ pub(crate) enum CheckpointFile<'a> {
     Pickle,
     /// Storage (block of tensor values), with its key.
     Storage(&'a str),
-    /// Any other file.
+    /// File that is neither the pickle nor a storage.
     Other,
 }
 

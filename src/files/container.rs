@@ -20,8 +20,9 @@
 //!
 //! A file that is in the page cache is read one frame block after another. When a reader that decodes whole frame
 //! blocks enters a block, it tells the system which block comes next, so that the system reads it ahead. A file that is
-//! not in the page cache is scanned in stages ([`FrameSource::ahead`]). Times of a scan on the same machine, by frame
-//! blocks and in stages:
+//! not in the page cache is read in stages by a scan (pass over all frames): one thread fetches bytes from the disk
+//! before others need them ([`FrameSource::ahead`]). Times of a scan on the same machine, by frame blocks and in
+//! stages:
 //!
 //! | file | raw tiles, ms | compressed tiles, ms |
 //! |---|---|---|
@@ -60,8 +61,8 @@ impl FrameSource for Container {
         Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
     }
 
-    /// Returns the prefetcher, with which a scan reads the file in stages. Returns `None` if the file is in the page
-    /// cache, where a scan in stages is not faster (times: see the module documentation).
+    /// Returns the prefetcher, with which a scan (pass over all frames) reads the file ahead in stages. Returns `None`
+    /// if the file is in the page cache, where a scan in stages is not faster (times: see the module documentation).
     fn ahead(&self) -> Option<&dyn Prefetch> {
         match self.reader.is_cached(CACHE_SAMPLES) {
             Some(true) => None,

@@ -12,7 +12,7 @@ const TOTALS_FIRST_FRACTION: f64 = 0.01;
 /// Counts of the rows of a file that have defects, and of the rows that the reader dropped because of defects.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Defects {
-    /// Number of rows of the file, without padding.
+    /// Number of rows (Gaussians) of the file, not counting rows that only pad it.
     pub rows: usize,
     /// Number of rows with at least one defect.
     pub defective: usize,

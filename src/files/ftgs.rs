@@ -34,9 +34,10 @@ pub const MIN_TIME_DEVIATION: f64 = 0.02;
 /// Opacity to which the player raises the opacity of every Gaussian at every time, if it is lower. Written to the
 /// header, and assumed if a header does not state it.
 const OPACITY_FLOOR: f64 = 1e-4;
-/// Names of the properties that an INRIA PLY does not have, in the order of [`StoredParams::format_specific`].
+/// Names of the properties that a `.ftgs.ply` file has in addition to those of an INRIA PLY, in the order of
+/// [`StoredParams::format_specific`].
 const OWN_PROPERTIES: [&str; PARAMS_PER_GAUSSIAN] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
-/// First word of the header comment by which a file of this format is recognized.
+/// First word of the header comment by which a `.ftgs.ply` file is recognized.
 pub const MARKER_COMMENT: &str = "ftgs_version";
 
 /// Mapping of the times of a sequence to the time from 0 to 1 that players use, with the number of frames and the frame
@@ -101,7 +102,7 @@ pub struct FtgsHeader {
 /// left out.
 #[derive(Debug)]
 pub struct Ftgs {
-    /// Settings of the header.
+    /// Settings that the header of the file states.
     pub header: FtgsHeader,
     /// Parameters of the Gaussians that were read.
     pub params: StoredParams,
@@ -295,7 +296,8 @@ mod tests {
     use super::*;
     use crate::model::Gaussians;
 
-    /// Returns `count` Gaussians with linear motion in time windows and the SH degree `sh_degree`.
+    /// Returns parameters of `count` test Gaussians with the SH degree `sh_degree`. Each of them moves linearly and is
+    /// visible in a Gaussian window of time.
     fn params(count: usize, sh_degree: usize) -> StoredParams {
         let mut made = StoredParams {
             gaussians: Gaussians::zeros(count, sh_degree),

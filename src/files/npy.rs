@@ -1,15 +1,16 @@
 //! Checks the header of a NumPy array file, which may be malicious, before the header is given to the parser of another
 //! crate.
 
-/// Maximum length in bytes of the header of an array file. The header of an array of numbers usually has 118 bytes, and
-/// at most 54 more for every axis.
+/// Maximum length in bytes of the header of a NumPy array file. The header of an array of numbers usually has 118
+/// bytes, and at most 54 more for every axis.
 const MAX_HEADER_BYTES: u64 = 4096;
-/// Number of bytes to read from the start of an array file for checking its header: the maximum length of the header,
-/// and 12 bytes for the magic, the version and the length before it.
+/// Number of bytes to read from the start of a NumPy array file for checking its header: the maximum length of the
+/// header, and 12 bytes for the magic, the version and the length before it.
 pub(crate) const HEAD: u64 = MAX_HEADER_BYTES + 12;
 /// Maximum number of digits in the shape of an array, all axes together. The number of elements is then below 2⁶³.
 const MAX_SHAPE_DIGITS: usize = 18;
-/// Maximum nesting depth of brackets: the dictionary, the shape in it, and one more level.
+/// Maximum nesting depth of brackets in the header of a NumPy array file: the dictionary, the shape in it, and one more
+/// level.
 const MAX_BRACKET_DEPTH: usize = 3;
 
 /// Returns whether the header of a NumPy array file may be given to the parser. `head` holds the first [`HEAD`] bytes

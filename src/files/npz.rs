@@ -27,10 +27,11 @@ use crate::error::{Error, Result};
 const MAX_ARRAYS: usize = 4096;
 /// Maximum size in bytes of the list of files that an archive has at its end.
 const MAX_LIST: u64 = 4 << 20;
-/// Maximum ratio of the bytes of all decoded arrays, which are written to a scratch file, to the bytes of the archive.
-/// [`BASE_SCRATCH_BYTES`] are allowed in addition. Trained models need a ratio of 1 to 2.
+/// Maximum size of all decoded arrays, which are written to a scratch file, in bytes per byte of the archive.
+/// [`BASE_SCRATCH_BYTES`] are allowed in addition. Trained models need 1 to 2 bytes per byte.
 const SCRATCH_PER_BYTE: u64 = 64;
-/// Number of bytes of decoded arrays that are allowed in the scratch file for an archive of any size.
+/// Size in bytes of decoded arrays that is always allowed, however small the archive is. [`SCRATCH_PER_BYTE`] bytes per
+/// byte of the archive are allowed in addition.
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
 /// Largest possible ratio of decompressed to compressed bytes with DEFLATE.
 const MAX_DEFLATE_FACTOR: u64 = 1032;

@@ -59,7 +59,7 @@ pub(crate) enum Node {
     PersistentId(NodeId),
 }
 
-/// Object tree that a pickle builds.
+/// Object tree that a pickle describes: one node per Python value.
 #[derive(Debug)]
 pub(crate) struct Pickle {
     nodes: Vec<Node>,

@@ -161,9 +161,9 @@ const ALLOW_GAPS_HINT: &str = "--allow-gaps reads the existing frames as the who
 /// Entries of a folder whose names are those of frames of a sequence, sorted in natural order (`frame_2` before
 /// `frame_10`).
 pub(crate) struct FrameFiles {
-    /// Entries that are files; each is a frame.
+    /// Entries of the folder that are files. Each of them is one frame.
     frames: Vec<PathBuf>,
-    /// Entries that are named like frames but are not files, such as folders.
+    /// Entries of the folder that are named like frames but are not files, such as folders.
     others: Vec<PathBuf>,
 }
 

@@ -22,12 +22,12 @@ pub mod write;
 
 use serde::{Deserialize, Serialize};
 
-/// Version of the format that is read and written.
+/// Version of the `.sog` format that is read and written.
 pub const VERSION: u64 = 2;
-/// Name of the file in the archive that describes the images.
+/// Name of the file in a `.sog` archive that describes its images.
 pub const META_FILE: &str = "meta.json";
 
-/// Content of the file `meta.json` of an archive.
+/// Content of the file `meta.json` of a `.sog` archive.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Meta {
     pub(crate) version: u64,

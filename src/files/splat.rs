@@ -15,17 +15,17 @@ use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, sh_from_color};
 
-/// Number of bytes per Gaussian.
+/// Number of bytes per Gaussian in a `.splat` file.
 pub const ROW_BYTES: usize = 32;
 /// Minimum standard deviation, in scene units, of a Gaussian after reading. Smaller values of the file are raised to
 /// the minimum, so that their logarithms are finite.
 const MIN_SCALE: f32 = 1e-7;
 
-/// Reads the Gaussians of the `.splat` file at `path`, with SH degree 0.
+/// Reads the Gaussians of the `.splat` file at `path`, with SH degree 0. Accepts positions and scales that are NaN or
+/// infinite, and zero quaternions.
 ///
 /// # Errors
-/// Fails if the file is not a whole number of rows, or if the Gaussians need more memory than `memory`. Positions and
-/// scales may be NaN or infinite, and quaternions zero.
+/// Fails if the file is not a whole number of rows, or if the Gaussians need more memory than `memory`.
 pub fn read_splat(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let map = FileMap::open(path)?;
     let count = map.len() / ROW_BYTES;

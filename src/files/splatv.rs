@@ -20,7 +20,7 @@ use crate::error::{Error, Result, quoted};
 
 /// First 32-bit word of every `.splatv` file.
 pub const MAGIC: u32 = 0x674b;
-/// Number of texels in a row of the texture.
+/// Number of texels in one line of the texture, which holds 1024 Gaussians.
 pub const TEXELS_PER_ROW: usize = 4096;
 /// Number of bytes that store one Gaussian: four texels.
 pub const ROW_BYTES: usize = 64;
@@ -51,7 +51,7 @@ pub struct SplatvGaussian {
     pub rgb: [f64; 3],
     /// Opacity at dt = 0, its maximum over time, in [0, 1].
     pub opacity: f64,
-    /// Time at which the opacity is highest.
+    /// Time at which the opacity is highest: the center of the temporal window.
     pub center: f32,
     /// Width of the temporal window: √2 × its standard deviation.
     pub width: f32,
@@ -100,8 +100,8 @@ pub struct Splatv {
     /// Offset in bytes of the texture in the file.
     start: usize,
     count: usize,
-    /// Number of rows (Gaussians) of the texture that the header states, if the file ends before that many rows; `None`
-    /// if the file is complete.
+    /// Number of rows (Gaussians and padding) that the texture has according to the header, if the file ends before its
+    /// last row; `None` if the file is complete.
     declared: Option<usize>,
     cameras: Value,
 }

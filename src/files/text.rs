@@ -53,7 +53,7 @@ pub(crate) struct TextLines {
     file: BufReader<File>,
     line: Vec<u8>,
     number: usize,
-    /// Offset in bytes, in the file, of the next line.
+    /// Offset of the next line in the file, in bytes.
     at: u64,
 }
 

@@ -24,11 +24,11 @@ use super::sog::Meta;
 use crate::files::ftgs::{ClipTimes, PARAMS_PER_GAUSSIAN};
 use crate::model::StoredParams;
 
-/// Version of the format that is read and written.
+/// Version of the `.tsog` format that is read and written.
 pub const VERSION: u64 = 4;
-/// Name of the playback profile that players expect.
+/// Name of the playback profile that `meta.json` of a written `.tsog` file states, because players expect it.
 const PROFILE: &str = "org.opsiclear.tsog-playback";
-/// Number of frames that is assumed for a file that does not give a duration.
+/// Number of frames that is assumed for a sequence whose `.tsog` file states no duration.
 const DEFAULT_FRAMES: usize = 300;
 
 /// Times at which the Gaussians of a file are visible, and whether they move.
@@ -66,7 +66,7 @@ pub struct TimedGaussians {
     pub clip: ClipTimes,
 }
 
-/// Content of the file `meta.json` of an archive.
+/// Content of the file `meta.json` of a `.tsog` archive.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct TsogMeta {
     #[serde(flatten)]

@@ -5,15 +5,15 @@ use std::io::Cursor;
 
 use image_webp::{ColorType, DecodingError, WebPDecoder, WebPEncoder};
 
-/// Maximum side of an image in pixels that the format can store.
+/// Maximum width and height of a WebP image in pixels.
 pub const MAX_SIDE: usize = 16_384;
 
 /// Image of four bytes (red, green, blue, alpha) per pixel, row by row from the top.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RgbaImage {
-    /// Number of columns, in pixels.
+    /// Width of the image in pixels.
     pub width: usize,
-    /// Number of rows, in pixels.
+    /// Height of the image in pixels.
     pub height: usize,
     /// Pixels, `width` × `height` of them.
     pub pixels: Vec<[u8; 4]>,

@@ -108,10 +108,11 @@ pub struct FieldSummary {
     /// Mean PSNR of renders with the half-precision deformation field, compared with renders with the exact field, dB.
     #[serde(deserialize_with = "number")]
     pub rounding: f64,
-    /// Mean PSNR of renders with the exact deformation field, compared with renders of the original, dB; `None` if
-    /// `rounding` alone decided that half precision is used.
+    /// Mean PSNR of renders with the exact deformation field, compared with renders of the original, dB; `None` if it
+    /// was not measured, because `rounding` is so high (60 dB or more) that half precision is used in any case.
     pub result: Option<f64>,
-    /// Minimum value of `rounding` for which half precision is used, dB.
+    /// Minimum PSNR, dB, between renders with the half-precision and with the exact deformation field (`rounding`) for
+    /// which half precision is used.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }
@@ -202,7 +203,8 @@ pub struct ShDegreeSummary {
     /// Mean PSNR of renders with all SH degrees compared with renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
-    /// PSNR, dB, below which an SH degree in `tried` was rejected.
+    /// Minimum PSNR, dB, between renders with a lower SH degree and with all degrees. A degree in `tried` with a lower
+    /// PSNR was rejected.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }

@@ -14,12 +14,12 @@ pub(super) const PER_THREAD: u64 = 2 << 20;
 /// Amount of information about memory and time that a run sends as events before it starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Verbosity {
-    /// No information about memory and time.
+    /// The run reports nothing about memory and time.
     #[default]
     Nothing,
-    /// Estimated time and maximum memory.
+    /// The run reports its estimated time and its maximum memory.
     Time,
-    /// Memory of every stage, number of full reads of the input, and estimated time.
+    /// The run reports the memory and the estimated time of every stage, and the number of full reads of the input.
     Plan,
 }
 

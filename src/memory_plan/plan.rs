@@ -134,7 +134,7 @@ impl MemoryPlan {
     }
 
     /// Returns the maximum number of times that the whole input is read, summed over all stages. It is at most 1 if all
-    /// decoded tiles stay in memory.
+    /// decoded tiles (stored blocks of the input) stay in memory.
     pub fn full_reads(&self) -> f64 {
         let sum: f64 = self.estimates.iter().map(|estimate| estimate.reads).sum();
         if self.limits.keeps_tiles { sum.min(1.0) } else { sum }

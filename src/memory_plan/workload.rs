@@ -323,16 +323,16 @@ impl Throughput {
         Throughput { states: 1.0, contribution_time: 1.0, removal_time: 1.0, render_time: 1.0, processors: None };
 }
 
-/// Time for rendering one view for a certain purpose, such as finding contributions: a part per Gaussian plus a part
+/// Time for rendering one view for a certain purpose, such as finding contributions: a time per Gaussian plus a time
 /// per pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct RenderCost {
-    /// Time of one view per Gaussian, in seconds on one processor core.
+    /// Time for rendering one view, per Gaussian of the scene, in seconds on one processor core.
     gaussian: f64,
-    /// Time of one view per pixel, in seconds on one processor core.
+    /// Time for rendering one view, per pixel of the image, in seconds on one processor core.
     pixel: f64,
-    /// Function that returns the measured ratio by which both times are multiplied, for example
-    /// [`Throughput::render_time`].
+    /// Function that returns the factor by which the times `gaussian` and `pixel` are multiplied: the measured time of
+    /// this kind of rendering divided by the assumed time, for example [`Throughput::render_time`].
     pace: fn(&Throughput) -> f64,
 }
 
@@ -348,8 +348,8 @@ pub const REMOVAL_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-
 pub const RENDER_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render_time };
 
 /// Returns the bytes of memory that zstd takes for its tables for finding matches, at the compression level `level`,
-/// for `bytes` bytes of input. There are two tables of 4-byte entries, each with at most twice as many entries as the
-/// input has bytes. Together they do not exceed a maximum, which depends on the level.
+/// for `bytes` bytes of input. There are two tables of 4-byte entries. Each has at most twice as many entries as the
+/// input has bytes, rounded up to a power of two. Together they do not exceed a maximum, which depends on the level.
 fn zstd_tables(level: i32, bytes: u64) -> u64 {
     let most_mebibytes = match level {
         ..=3 => 1,

@@ -94,7 +94,8 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
     Clustering { leader_of, joins, rounds, sequential }
 }
 
-/// For every node (Gaussian or merged group), the nodes of lower rank that could become its leader.
+/// For every node (Gaussian or merged group), the nodes of lower rank that it could join (that could become its
+/// leader).
 struct Predecessors {
     start: Vec<usize>,
     /// Pairs (possible leader, node), where the leader is the node that the other may join. Sorted by node, then by the

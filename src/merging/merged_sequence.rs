@@ -41,11 +41,11 @@ pub struct MergedSequence<'a> {
 }
 
 impl<'a> MergedSequence<'a> {
-    /// Creates the sequence of the Gaussians `survivors` of `source`, some of which are replaced by proxies. `clusters`
-    /// yields for each proxy the index in `survivors` of the Gaussian that it replaces (the leader of its cluster),
-    /// then the ids and weights of the cluster's members. `merge`: parameters by which proxies are computed, except for
-    /// their position. A proxy is always at the mean of its members: its position is computed anew at every frame, so
-    /// it need not move with the leader.
+    /// Creates the sequence of the Gaussians `survivors` (ids) of `source`, some of which are replaced by proxies.
+    /// - `clusters`: for each proxy, the index in `survivors` of the Gaussian that it replaces (the leader of its
+    ///   cluster), then the ids and weights of the cluster's members.
+    /// - `merge`: parameters by which proxies are computed. Its rule for the position is not used: a proxy is at the
+    ///   mean of its members at every frame, so it need not move with the leader.
     pub fn new(
         source: &'a dyn FrameSource,
         survivors: &'a [u32],
@@ -114,8 +114,8 @@ impl FrameSource for MergedSequence<'_> {
 struct MergedMembers {
     /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
-    /// For every selected Gaussian, the index of its id in `ids`. A proxy has the id of its leader (most important
-    /// member).
+    /// For every Gaussian selected for reading, the index of its id in `ids`. A proxy (Gaussian that replaces a
+    /// cluster) has the id of its leader (most important member).
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
     /// For every proxy (Gaussian that replaces a cluster) and every member of its cluster: the index of the member's id
@@ -124,7 +124,7 @@ struct MergedMembers {
 }
 
 struct Proxy {
-    /// Index of this proxy (Gaussian that replaces a cluster) among the selected Gaussians.
+    /// Index of this proxy (Gaussian that replaces a cluster) among the Gaussians selected for reading.
     row: usize,
     members: Range<usize>,
 }

@@ -235,8 +235,8 @@ struct MergeNodes<'a> {
     survivors: &'a Survivors<'a>,
     groups: &'a MergeGroups,
     proxies: &'a Gaussians,
-    /// Row of each node in its table of states: in `survivors.states` for a single Gaussian, in `proxies` for a merged
-    /// group.
+    /// For each node, the row with its state: a row of `survivors.states` for a single Gaussian, a row of `proxies` for
+    /// a merged group.
     place: Vec<u32>,
 }
 

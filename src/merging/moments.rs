@@ -10,8 +10,9 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// Maximum number of sweeps over the three pairs of rows of the factor F. Quadratic convergence needs about six sweeps;
-/// rounding noise in nearly equal singular values needs a few more.
+/// Maximum number of sweeps of the Jacobi SVD. A sweep makes each of the three pairs of rows of the 3-row matrix
+/// orthogonal once. Convergence is quadratic and needs about six sweeps; rounding noise in nearly equal singular values
+/// needs a few more.
 const MAX_SWEEPS: usize = 40;
 
 /// One Gaussian of a mixture, with its weight.
@@ -19,7 +20,7 @@ const MAX_SWEEPS: usize = 40;
 pub struct WeightedGaussian {
     /// Weight in the mixture, ≥ 0; the weights sum to 1.
     pub weight: f64,
-    /// Center μ, in any unit of length.
+    /// Center μ of the Gaussian, in any unit of length.
     pub position: DVec3,
     /// Rotation R, a unit quaternion.
     pub rotation: DQuat,
@@ -30,7 +31,7 @@ pub struct WeightedGaussian {
 /// A Gaussian without color and opacity: mean, and covariance R S Sᵀ Rᵀ given by the rotation R and the scales S.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ellipsoid {
-    /// Center, in the unit of length of the input Gaussians.
+    /// Center of the Gaussian, in the unit of length of the input Gaussians.
     pub mean: DVec3,
     /// Rotation, a unit quaternion with w ≥ 0.
     pub rotation: DQuat,
@@ -77,8 +78,8 @@ pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     Ellipsoid { mean, rotation: unit_from_axes(&frame), scales: DVec3::from(order.map(|r| lengths[r])) }
 }
 
-/// Rotates pairs of rows until all three are orthogonal. Returns one axis for each resulting row r, such that the
-/// original rows are Σ_r axis_r ⊗ row_r.
+/// Rotates pairs of the three `rows` until all are orthogonal to one another (one-sided Jacobi SVD). Returns a unit
+/// vector axis_r for each resulting row r, such that the original matrix of rows is Σ_r axis_r ⊗ row_r.
 fn orthogonalize_rows(rows: &mut [Vec<f64>; 3]) -> [DVec3; 3] {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
     // Relative to the product of the lengths, a dot product of n terms has about this rounding error.
@@ -123,9 +124,9 @@ fn unit_from_axes(frame: &DMat3) -> DQuat {
     if rotation.w < 0.0 { -rotation } else { rotation }
 }
 
-/// Returns `ellipsoid` with its axes permuted and flipped so that its rotation is the nearest to `reference`. Of the 24
-/// rotations that map axes to axes, the one with the largest |⟨q, reference⟩| is taken, the first one on a tie. The
-/// quaternion q gets the sign nearest to `reference`.
+/// Returns `ellipsoid` with its axes permuted and flipped so that its rotation is the nearest to `reference`. There are
+/// 24 such rotations q of the same ellipsoid. The one with the largest |⟨q, reference⟩| is taken, the first one on a
+/// tie. The sign of the quaternion q is the one nearest to `reference`.
 ///
 /// A deformation field adds its deltas axis by axis. So the axes of a merged Gaussian must be in the same order as
 /// those of the Gaussian whose deltas it gets.

@@ -82,9 +82,9 @@ impl PairMeter<'_> {
     /// `ids` and `reference` must be the same in every call.
     ///
     /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, and [`bytes_per_gaussian`] for every Gaussian in a pair.
-    /// If trajectories are gathered, also 8 bytes for each of `ids`; while they are being gathered, 12 more and the
-    /// values of the frames held. Nothing grows with the number of frames. If neither positions nor opacities vary,
-    /// only the first frame is measured.
+    /// If trajectories are gathered, also 8 bytes for each of `ids`; while they are being gathered, 12 more bytes and
+    /// the values of the frames that the reader keeps. The memory does not grow with the number of frames. If neither
+    /// positions nor opacities vary, only the first frame is measured.
     ///
     /// # Errors
     /// Fails if the source cannot be read, or the scratch file cannot be read or written. The scratch file is then

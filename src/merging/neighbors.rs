@@ -93,7 +93,8 @@ impl PointIndex {
         &self.points
     }
 
-    /// Creates a reusable query object; each thread needs its own.
+    /// Creates a search for the points nearest to a position. It can be used for many positions; each thread needs its
+    /// own.
     pub fn search(&self) -> NeighborSearch<'_> {
         NeighborSearch { index: self, last_voxel: None, around: Vec::new(), nearest: NearestPoints::default() }
     }
@@ -118,8 +119,8 @@ fn hash(number: u64) -> u64 {
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
     last_voxel: Option<[u32; 3]>,
-    /// Voxels that contain points, out of the last queried voxel and the 26 around it. Each has the step along the
-    /// three axes that leads to it, encoded as in [`STEPS`].
+    /// Of the 27 voxels at and around the voxel queried last, those that contain points. Each comes with the step along
+    /// the three axes from the queried voxel to it, encoded as in [`STEPS`].
     around: Vec<([u8; 3], Occupied)>,
     nearest: NearestPoints,
 }

@@ -28,10 +28,10 @@ const THOMSEN: f64 = 1.6075;
 /// f64.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProxyState {
-    /// Center, in scene units.
+    /// Center of the proxy, in scene units.
     pub position: DVec3,
-    /// Unit quaternion (w, x, y, z). Its axes are in the order of the axes of the leader (most important member of the
-    /// cluster), and its sign is the one nearest to the leader's quaternion.
+    /// Rotation of the proxy: unit quaternion (w, x, y, z). Its axes are in the order of the axes of the leader (most
+    /// important member of the cluster), and its sign is the one nearest to the leader's quaternion.
     pub rotation: [f64; 4],
     /// Natural logarithms of the scales (scene units); always finite.
     pub log_scale: [f64; 3],

@@ -33,10 +33,10 @@ pub(crate) type TrajectorySample = [f32; 4];
 /// Attributes that a [`TrajectorySample`] contains.
 pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
-/// Maximum difference between the indices of two requested Gaussians in the file for which one read covers both
-/// Gaussians and those between them.
+/// Maximum gap between two requested Gaussians, as the difference of their indices in the scratch file, up to which
+/// both are read at once, together with the Gaussians between them. Across larger gaps, they are read separately.
 const GAP: u32 = 32;
-/// Maximum number of Gaussians that one read covers.
+/// Maximum number of Gaussians whose trajectories are read from the scratch file at once.
 const RUN: u32 = 2048;
 
 /// Trajectories of Gaussians in an unnamed scratch file, which is deleted when this value is dropped.
@@ -44,7 +44,7 @@ pub(crate) struct Trajectories {
     file: Spill,
     count: usize,
     frames: usize,
-    /// Number of consecutive frames that the file stores together.
+    /// Number of consecutive frames per block of the file. A block stores all values of one Gaussian together.
     block: usize,
     /// Range of indices of the values in a [`TrajectorySample`] that vary with time.
     varying: Range<usize>,

@@ -276,7 +276,7 @@ pub struct MemoryProfile {
     pub prepared: u64,
     /// Bytes per Gaussian of a memory-mapped file that is read as a whole.
     pub file: u64,
-    /// Bytes of memory that do not depend on the number of Gaussians.
+    /// Bytes of memory that the open input takes regardless of its number of Gaussians.
     pub fixed: u64,
     /// Number of frames that are decoded together, all of which a reader may keep in memory; 0 if each frame is read
     /// alone.
@@ -287,13 +287,13 @@ pub struct MemoryProfile {
     pub columns: u64,
     /// Approximate CPU seconds on one core to read the state of one Gaussian at one frame.
     pub seconds_per_state: f64,
-    /// Bytes of memory that all decoded values of a container take; 0 if nothing is decoded or the values cannot be
-    /// kept.
+    /// Bytes of memory that all decoded values of a container take together. 0 if the input has no encoded values, or
+    /// cannot keep decoded ones in memory.
     pub decoded: u64,
 }
 
 impl MemoryProfile {
-    /// Returns the profile of a container whose tiles (the units of decoding) each hold `frame_block` frames.
+    /// Returns the memory profile of a container whose tiles (the units of decoding) each hold `frame_block` frames.
     pub fn for_tiles(frame_block: u64) -> MemoryProfile {
         MemoryProfile {
             per_gaussian: 0,
@@ -319,24 +319,26 @@ impl MemoryProfile {
 pub struct ColumnInfo {
     /// Name of the column (attribute).
     pub name: String,
-    /// Number of f32 components of the column per Gaussian.
+    /// Number of f32 components that the column (attribute) has per Gaussian.
     pub width: u32,
-    /// Maximum absolute error of decoded values against the values that were packed, in the unit of the column; 0 means
-    /// exact to the bit.
+    /// Maximum absolute difference between decoded values and the values from which the container was made, in the unit
+    /// of the column (attribute); 0 means exact to the bit.
     pub max_error: f64,
-    /// Number of tiles (blocks of Gaussians × frames) of the column.
+    /// Number of tiles (blocks of Gaussians × frames) into which the column (attribute) is divided.
     pub tiles: usize,
-    /// Number of tiles of the column that store only one frame, because their values are the same in all frames.
+    /// Number of tiles (blocks of Gaussians × frames) that store only one frame, because their values are the same in
+    /// all frames.
     pub constant_tiles: usize,
-    /// Number of tiles of the column that are stored without compression.
+    /// Number of tiles (blocks of Gaussians × frames) that are stored without compression.
     pub raw_tiles: usize,
-    /// Bytes that the column takes in the file; bytes that several tiles share count once.
+    /// Bytes that the column (attribute) takes in the file. Equal tiles (blocks of Gaussians × frames) may share bytes,
+    /// which count once.
     pub stored_bytes: u64,
-    /// Bytes that the column would take with one f32 per frame, component and Gaussian.
+    /// Bytes that the column (attribute) would take with one f32 per frame, component and Gaussian.
     pub raw_bytes: u64,
-    /// Smallest finite value of the column; `None` if it has no finite values.
+    /// Smallest finite value of the column (attribute); `None` if it has no finite values.
     pub min: Option<f32>,
-    /// Largest finite value of the column; `None` if it has no finite values.
+    /// Largest finite value of the column (attribute); `None` if it has no finite values.
     pub max: Option<f32>,
 }
 

@@ -68,8 +68,8 @@ const MODEL_FORMATS: [ModelFormat; 17] = [
 
 /// Returns the background color that a model was trained with. `cameras` is the model folder or a file in it.
 ///
-/// The color is white if `cfg_args` in that folder says so, as 3DGS and trainers derived from it write it. Returns
-/// `None` if `cfg_args` does not say so or cannot be read.
+/// Returns white if the file `cfg_args` in the folder has `white_background=True`, as 3DGS and trainers derived from it
+/// write it. Returns `None` if this key is false or missing, or if the file cannot be read.
 pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
     let folder = if cameras.is_dir() { cameras } else { cameras.parent()? };
     let arguments = Arguments::read(&folder.join("cfg_args")).ok()?;

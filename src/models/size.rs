@@ -18,7 +18,7 @@ pub struct ModelSize {
     pub field: u64,
     /// Bytes of the states of Gaussians that are stored frame by frame.
     pub frames: u64,
-    /// Bytes of everything else, such as the configuration.
+    /// Bytes of data other than Gaussians, deformation field and frames, such as the configuration.
     pub rest: u64,
 }
 

@@ -60,7 +60,7 @@ impl Packing {
         source.info().times.len().div_ceil(self.frame_block())
     }
 
-    /// Returns the frames of `source` that are in frame block number `block`.
+    /// Returns the range of frames of `source` in frame block (consecutive frames) number `block`.
     pub fn frames_of_block(&self, source: &dyn FrameSource, block: usize) -> Range<usize> {
         let start = block * self.frame_block();
         start..source.info().times.len().min(start + self.frame_block())
@@ -300,10 +300,11 @@ pub enum BlockChange {
     /// Gaussians of which every attribute may differ from the frame block before. Attributes that vary with time in the
     /// source are encoded for every frame, the other attributes for the first frame only.
     New,
-    /// Gaussians that are equal in all frames of the frame block, so that only its first frame is encoded.
-    Still,
-    /// Gaussians that are equal in all frames of the frame block, and equal to the frame block before. Nothing is
+    /// Gaussians that are equal in all frames of the frame block (consecutive frames), so that only its first frame is
     /// encoded.
+    Still,
+    /// Gaussians that are equal in all frames of the frame block (consecutive frames), and equal to the frame block
+    /// before. Nothing is encoded.
     Repeating,
 }
 

@@ -111,7 +111,8 @@ struct PackedFrame {
     count: usize,
     /// Number of visible Gaussians that were left out because a value is not finite.
     not_finite: usize,
-    /// Smallest and largest coordinates in Unreal's axes, in centimeters; zeros if there are no Gaussians.
+    /// Minimum, then maximum, of the Gaussians' positions on each of Unreal's axes, in centimeters; zeros if there are
+    /// no Gaussians.
     bounds: [[f64; 3]; 2],
 }
 

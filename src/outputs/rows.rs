@@ -34,7 +34,7 @@ pub struct RowTable<'a> {
     pub keep: &'a [bool],
 }
 
-/// Values of one column of the table, one per Gaussian.
+/// Column of the table of statistics and scores: one value per Gaussian.
 #[derive(Clone, Copy)]
 enum TableColumn<'a> {
     F64(&'a [f64]),
@@ -83,7 +83,7 @@ impl RowTable<'_> {
         self.write_csv_to(file).map_err(Error::io("write", path))
     }
 
-    /// Returns the columns of the table in order, each with its name.
+    /// Returns the columns of the table in the order in which they are written, each with its name.
     fn columns(&self) -> Vec<(&'static str, TableColumn<'_>)> {
         let column = |statistic: Statistic| match statistic.accessors() {
             model::StatisticArray::F64(values, _) => (statistic.column_name(), TableColumn::F64(values(self.rows))),

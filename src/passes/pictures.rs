@@ -19,7 +19,8 @@ use crate::model::{AttributeValues, Attributes, Camera, FrameView, Gaussians};
 use crate::render::{Image, blend_features, render};
 use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 
-/// Number of views per thread in a batch. With fewer, threads would wait longer for the last view of each batch.
+/// Number of views per thread in a batch (views that are processed together, in parallel). With fewer, threads would
+/// wait longer for the last view of each batch.
 pub const VIEWS_PER_THREAD: usize = 4;
 
 /// Selection of the Gaussians of a frame source to render, and of the attributes to read for this.
@@ -59,7 +60,7 @@ pub struct BatchLimits {
     /// Maximum number of different frames in a batch. For each of these frames, the Gaussians of every rendered source
     /// are in memory.
     pub frames: usize,
-    /// Maximum number of views in a batch.
+    /// Maximum number of views in a batch (views that are processed together, in parallel).
     pub views: usize,
     /// Maximum number of decoded frames that a reader keeps in memory, for readers that decode several frames together.
     pub held: usize,
@@ -245,14 +246,14 @@ pub(crate) struct Workers<W> {
 }
 
 impl<W: Send> Workers<W> {
-    /// Creates a set without workers. They are created when they are needed.
+    /// Creates an empty set of workers. Workers are added as soon as views are passed to them.
     pub(crate) fn new(limits: Limits) -> Self {
         Workers { limits, free: Mutex::default() }
     }
 
-    /// Passes each of the views `pictures` to one of the workers: `visit` gets the worker, the Gaussians of `subject`
-    /// at the frame of the view, and its camera, an element of `cameras`. `new_worker` creates a worker if all others
-    /// are busy.
+    /// Calls `visit` once for each of the views `pictures`, on several threads. Arguments of `visit`: a worker, which
+    /// accumulates results; the Gaussians of `subject` at the frame of the view; and the camera of the view, an element
+    /// of `cameras`. `new_worker` creates a worker if all others are busy.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -334,7 +335,8 @@ mod tests {
         }
     }
 
-    /// Scene whose Gaussians have features; a pixel's color is the direction of the ray through the pixel.
+    /// Test scene whose Gaussians have features (values that take the place of colors). The decoded color of a pixel
+    /// does not depend on them: it is the camera center plus the direction of the ray through the pixel.
     struct RayScene(DemoScene);
 
     impl FrameSource for RayScene {

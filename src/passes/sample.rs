@@ -30,10 +30,10 @@ pub struct ViewSampler {
 }
 
 impl ViewSampler {
-    /// Creates a sampler with the strides `frame_stride` and `view_stride` of `scan`. It selects the first frame that
-    /// has views, then every `frame_stride`-th of these frames. In a selected frame, it selects every `view_stride`-th
-    /// view. Each selected frame starts one view later than the one before (modulo `view_stride`), so that all views
-    /// are selected in turn.
+    /// Creates a sampler with the strides `frame_stride` and `view_stride` of `scan`:
+    /// - Frames without views are not counted. Of the others, the first is selected, and then every `frame_stride`-th.
+    /// - In a selected frame, every `view_stride`-th view is selected. The first view is one further in each selected
+    ///   frame (modulo `view_stride`), so that all views are selected in turn.
     pub fn new(scan: &recipe::ScanParams) -> Self {
         Self::with_strides(scan.frame_stride.get() as usize, scan.view_stride.get() as usize)
     }
@@ -85,9 +85,9 @@ pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames:
     select_evenly_over_frames(&left, scan.look_pictures, frames)
 }
 
-/// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians that are ever alive (opacity
-/// ≥ alpha_min) are alive in one of them, provided that each is alive without a gap. `life` holds for each Gaussian the
-/// number of frames in which it is alive, out of `frames` frames.
+/// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians are alive (opacity ≥
+/// alpha_min) in one of them. Gaussians that are never alive are ignored; the others are assumed to be alive without a
+/// gap. `life` holds for each Gaussian the number of frames in which it is alive, out of `frames` frames.
 pub fn frames_to_cover(life: &[u32], frames: usize) -> usize {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&life| life > 0).collect();
     if lives.is_empty() {
@@ -98,8 +98,9 @@ pub fn frames_to_cover(life: &[u32], frames: usize) -> usize {
     frames.div_ceil(shortest as usize)
 }
 
-/// Selects at most `pictures` views with [`select_evenly`]. Usually takes [`VIEWS_PER_FRAME`] views of each frame that
-/// it uses; takes fewer (at least one) if otherwise fewer than `frames` frames would be used.
+/// Selects at most `pictures` views with [`select_evenly`], from at least `frames` frames if possible. Takes
+/// [`VIEWS_PER_FRAME`] views of each frame that it uses, or fewer (at least one) if this is necessary to use `frames`
+/// frames.
 pub fn select_evenly_over_frames(schedule: &ViewSchedule, pictures: usize, frames: usize) -> Vec<FrameView> {
     select_evenly(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
 }

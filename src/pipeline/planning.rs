@@ -85,7 +85,7 @@ pub(crate) enum MemoryFallback {
     Nothing,
     /// Refinement without time-varying deltas: the values that it adds to stored parameters are constant in time.
     ConstantInTime {
-        /// Smallest memory limit, bytes, with which the added values would vary in time.
+        /// Smallest memory limit, bytes, with which refinement would also add values that vary in time.
         required_bytes: u64,
     },
     /// Refinement without time-varying deltas and without SH coefficients above degree 0.

@@ -21,7 +21,7 @@ use crate::pruning::score::UserOverrides;
 pub struct Provenance {
     /// Name and version of the program.
     pub tool: String,
-    /// Digest of the input.
+    /// Digest (hash of the content) of the input for which the recipe file was written.
     pub input_digest: String,
 }
 
@@ -107,8 +107,10 @@ impl RunOptions {
     /// Returns the requested goal (a quality or a size on disk), if any.
     ///
     /// # Errors
-    /// Fails with a message for the user if there are several goals or both a goal and a target, if `max_loss` or
-    /// `ground_truth` is given without the other, or if a value in decibels is out of range.
+    /// Fails with a message for the user in these cases:
+    /// - there are several goals, or both a goal and a target number of Gaussians;
+    /// - `max_loss` or `ground_truth` (folder of photographs) is given without the other;
+    /// - a value in decibels is out of range.
     pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
         match (self.target(), self.min_psnr, self.max_loss, &self.ground_truth, self.target_size) {
             (_, None, None, None, None) => Ok(None),

@@ -322,7 +322,7 @@ pub struct RunState<'a> {
     pub journal: Journal,
     /// Description of the input for the summary. Computed only once, because its digest reads the whole input.
     pub input: Option<InputSummary>,
-    /// Text of the file `recipe.toml` that is written beside the result.
+    /// Content of the file `recipe.toml`, which is written beside the result and holds all parameters of the run.
     pub recipe: String,
     /// Statistics of the Gaussians that were already computed while the input, a stream, arrived.
     pub arrived: Option<Measured>,
@@ -332,7 +332,8 @@ pub struct RunState<'a> {
     pub ranking: Option<Arc<Ranking>>,
     /// Number of Gaussians in the output, if it was requested or has been found.
     pub target: Option<usize>,
-    /// Numbers of Gaussians with which the output fits the requested size on disk, in order of decreasing SH degree.
+    /// For each SH degree that the output may have, in decreasing order: the number of Gaussians with which the output
+    /// fits the requested size on disk. Empty if no size is requested.
     pub counts_within_bytes: Vec<ByteLimitFit>,
     /// Model without Gaussians that holds the settings of all models of this run, such as SH degree and merge
     /// parameters. Compressed models are made from it by adding Gaussians.

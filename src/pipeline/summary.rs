@@ -239,7 +239,7 @@ pub struct Summary {
     pub flags: FlagSummary,
     /// Numbers of Gaussians that were merged (stage 3 of the paper); `None` if nothing was merged.
     pub merge: Option<MergeSummary>,
-    /// Result of the search for a quality, if one was requested.
+    /// Result of the search for the smallest model with a requested quality, if a quality was requested.
     pub goal: Option<GoalSummary>,
     /// Measured effect of writing the deformation field in half precision; `None` if it was not requested.
     pub field: Option<FieldSummary>,

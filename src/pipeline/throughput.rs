@@ -218,8 +218,8 @@ struct MeasuredTime {
 }
 
 impl MeasuredTime {
-    /// Runs `work`, adds its time to the total, and returns its processor time in seconds; `None` if the system does
-    /// not report processor time.
+    /// Runs `work` and adds its processor time and wall-clock time to these totals. Returns its processor time in
+    /// seconds. If the system does not report processor time, adds nothing and returns `None`.
     fn time(&mut self, work: impl FnOnce()) -> Option<f64> {
         let clock = Stopwatch::start();
         work();

@@ -75,8 +75,8 @@ pub fn component_count(sh_degree: usize) -> usize {
 /// `[components, N]`. Leaves the other attributes in `points` as they are. Returns the number of Gaussians that become
 /// invisible.
 ///
-/// - Quaternions are normalized. Of the two signs of a quaternion, the one closer to the earlier content of `points` is
-///   taken.
+/// - Quaternions are normalized. Of the two signs of a quaternion, the one closer to the quaternion that `points` held
+///   before (that of the previous frame) is taken.
 /// - A Gaussian gets opacity 0, and is invisible, if one of its values is NaN or if a coordinate of its position is at
 ///   least [`POSITION_LIMIT`] quantization steps away from 0.
 ///
@@ -144,9 +144,10 @@ fn nearest(value: f64, step: f64) -> i32 {
     (value / step).round_ties_even() as i32
 }
 
-/// Normalizes the quaternions `rotation` and writes them as multiples of `step` into `points`. A quaternion and its
-/// negative are the same rotation; the one closer to the earlier content of `points` is written. Without this choice, a
-/// jump of the sign would make differences between frames large.
+/// Normalizes the quaternions `rotation` and writes them as multiples of `step` into `points`, which holds the
+/// quaternions of the previous frame (zeros before the first frame). A quaternion and its negative are the same
+/// rotation; the one closer to the previous quaternion is written. Without this choice, a jump of the sign would make
+/// differences between frames large.
 fn quantize_rotations(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
     let count = rotation.len();
     for i in 0..count {

@@ -60,7 +60,7 @@ pub struct PageSequence {
     pub sh_degree: usize,
     /// Time stamps of the encoded frames.
     pub times: Vec<f64>,
-    /// Quantization steps of the values.
+    /// Quantization steps of the encoded values: positions, rotations, scales, opacities and SH coefficients.
     pub steps: PlayerSteps,
     /// Scalar components of a Gaussian that vary with time, as ranges in increasing order: index of the first
     /// component, and number of components.
@@ -189,9 +189,10 @@ fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     to.finish().map_err(failed)
 }
 
-/// Returns the encoded bytes of one scalar component: a byte of flags, then the planes of bytes of the differences
-/// between frames. `start` has the values at the first frame of the sequence, `frames` the values at the frames of the
-/// chunk.
+/// Encodes one scalar component (such as the x of the position) for a chunk, and returns its bytes: a byte of flags,
+/// then the differences between frames. Of these, first the lowest byte of every difference, then the next byte of
+/// every difference, and so on. `start` has the values at the first frame of the sequence, `frames` the values at the
+/// frames of the chunk.
 fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     let mut orders = [false, true].map(|is_second| differences(start, frames, is_second));
     let cost = |values: &[u32]| values.iter().map(|&v| u64::from(32 - v.leading_zeros())).sum::<u64>();

@@ -19,7 +19,7 @@ use crate::scene::open_compressed;
 use crate::scene::view_selection::render_background;
 use crate::scene::{InputOptions, first_frame_box, open_scene, scratch_beside};
 
-/// Name of the stage, for progress and the memory plan.
+/// Name of the stage that writes the page, for progress messages and the memory plan.
 const NAME: &str = "view";
 
 /// Options of the command `view`, which writes a page that plays one or two models.
@@ -32,10 +32,10 @@ pub struct ViewOptions {
     pub compressed: Option<PathBuf>,
     /// Maximum number of frames, evenly spaced from the first to the last.
     pub max_frames: usize,
-    /// Maximum number of frames of the original if a compressed model is shown beside it; `None` means `max_frames`.
+    /// Maximum number of frames of the original that are shown beside a compressed model; `None`: as many as
+    /// `max_frames`.
     pub original_frames: Option<usize>,
-    /// Maximum SH degree of the original if a compressed model is shown beside it; `None` means the degree of the
-    /// original.
+    /// Maximum SH degree with which the original is shown beside a compressed model; `None`: its own SH degree.
     pub original_degree: Option<usize>,
     /// Background color: red, green, blue in [0, 1]. If it is `None`, [`render_background`] chooses the color.
     pub background: Option<[f32; 3]>,
@@ -79,8 +79,8 @@ fn is_page(output: &Path) -> bool {
     output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html") || ending.eq_ignore_ascii_case("htm"))
 }
 
-/// Writes the page that plays the model, or two models side by side. Returns the paths, the number of frames and the
-/// size of the page.
+/// Writes the page that plays the model, or two models side by side. Returns the path of the page, the number and size
+/// of the written files, and the number of frames.
 ///
 /// Memory: the Gaussians of one model at one frame, a group of its frames as quantized values
 /// ([`MAX_VALUES_PER_FRAME_GROUP`]), and the render of the poster.

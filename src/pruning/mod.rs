@@ -55,9 +55,9 @@ pub struct SelectionCounts {
     pub pruned_by_stage_1: usize,
     /// Number of candidates that are pruned because they reach neither threshold of stage 2.
     pub pruned_by_stage_2: usize,
-    /// Number of Gaussians that the stages prune but the user keeps.
+    /// Number of Gaussians that the selection by scores prunes but the user keeps.
     pub forced_keep: usize,
-    /// Number of Gaussians that the stages keep but the user drops.
+    /// Number of Gaussians that the selection by scores keeps but the user drops.
     pub forced_drop: usize,
     /// Number of Gaussians that stay in the end, with the user's overrides applied.
     pub kept: usize,

@@ -311,7 +311,7 @@ impl Scored {
     }
 
     /// Returns two statistics of every Gaussian: the contribution C, and the visibility Vis (fraction of the views in
-    /// which the Gaussian is on screen).
+    /// which the Gaussian is alive and on screen).
     ///
     /// # Errors
     /// Fails if the statistics are in a scratch file that cannot be read back.
@@ -351,10 +351,11 @@ impl Scored {
         self.terms.iter().map(summarize).collect()
     }
 
-    /// Writes three kinds of notes to `journal`, the record of the run: parts of scanning and scoring that the scene
-    /// did not need, numbers of Gaussians with unusual values, and advice if life spans are short. If the scan
-    /// `is_partial`, terms of motion and opacity are not mentioned, because they were not measured. `median_life`:
-    /// median number of frames in which a Gaussian is alive.
+    /// Writes notes to `journal`, the record of the run. There are three kinds of notes: parts of scanning and scoring
+    /// that the scene did not need, numbers of Gaussians with unusual values, and advice if life spans are short.
+    /// - `is_partial`: whether only some frames were scanned. Terms of motion and opacity were then not measured and
+    ///   are not mentioned.
+    /// - `median_life`: median number of frames in which a Gaussian is alive.
     fn record(&self, scene: &Scene, median_life: u32, is_partial: bool, journal: &mut Journal) {
         let info = scene.source().info();
         if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {

@@ -23,8 +23,8 @@ pub(crate) const NAME: &str = "visible";
 /// a view, averaged over views) and its peak W (maximum in one pixel).
 #[derive(Debug, Clone)]
 pub struct VisibilityStage {
-    /// Parameters of the scan, of which this stage uses the strides of pixels, views and frames, and the maximum number
-    /// of views.
+    /// Parameters by which statistics are computed. This stage uses only the strides of pixels, views and frames, and
+    /// the maximum number of views.
     pub recipe: recipe::ScanParams,
     /// Whether pruning rounds will rank the Gaussians again. If so, this stage has to render only every n-th column and
     /// row of pixels, where n is [`ranking_stride`].

@@ -3,7 +3,7 @@
 
 use super::{MOST_STEPS, Recipe};
 
-/// Effort of a run: time against quality.
+/// Effort of a run: trades run time for quality.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effort {
     /// A third of the recipe's optimization steps, fewer scored views, and more Gaussians removed per pruning round.
@@ -14,7 +14,8 @@ pub enum Effort {
     Best,
 }
 
-/// Values of recipe parameters for an effort other than the default; the fields are named like the parameters.
+/// Values that an effort (`fast` or `best`) gives to parameters of the recipe; the fields are named like the
+/// parameters.
 struct EffortSettings {
     look_pictures: usize,
     round_pictures: usize,

@@ -29,24 +29,25 @@ pub struct ScanParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ScanFrames {
-    /// Every frame.
+    /// The scan reads every frame.
     All,
-    /// A few evenly spaced frames if no decision of the run depends on the statistics of motion and opacity, otherwise
-    /// every frame.
+    /// The scan reads a few evenly spaced frames if no decision of the run depends on the statistics of motion and
+    /// opacity, otherwise every frame.
     Needed,
 }
 
-/// Definition of the motion of a Gaussian: which steps from one frame to the next count, and by which number their sum
-/// is divided.
+/// Definition of the motion of a Gaussian: which steps from one frame to the next count, and by which number a sum over
+/// steps is divided to get a mean.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionParams {
-    /// Definition of the paper: every step counts that ends in a frame in which the Gaussian is alive (its opacity is
-    /// at least `alpha_min`), even if it is not alive in the frame before. The divisor is the number of frames in which
-    /// it is alive; for the curvature, this number minus 2.
+    /// Motion as the paper defines it. Every step from one frame to the next counts if the Gaussian is alive (opacity ≥
+    /// alpha_min) in the second frame, even if it is not alive in the first. For the mean, the sum over the steps is
+    /// divided by the number of frames in which the Gaussian is alive. For the curvature, the sum over the turns
+    /// (changes from one step to the next) is divided by this number minus 2.
     Literal,
-    /// Only steps between consecutive frames in which the Gaussian is alive (opacity ≥ alpha_min) count. The divisor is
-    /// their number.
+    /// A step from one frame to the next counts only if the Gaussian is alive (opacity ≥ alpha_min) in both frames. For
+    /// the mean, the sum over the steps is divided by their number.
     Runs,
 }
 
@@ -70,11 +71,12 @@ pub enum Coverage {
 pub enum NonFinite {
     /// Stop the run with an error that states how many Gaussians have NaN or infinity, and the ids of the first five.
     Error,
-    /// Remove the Gaussian if at most 1% of all Gaussians are such; else stop the run like [`NonFinite::Error`].
+    /// Remove the Gaussians that have NaN or infinity if they are at most 1% of all; else stop the run like
+    /// [`NonFinite::Error`].
     Few,
-    /// Remove the Gaussian.
+    /// Remove every Gaussian that has NaN or infinity in some frame.
     Drop,
-    /// Keep the Gaussian in the output as it is.
+    /// Keep Gaussians that have NaN or infinity; the output has them unchanged.
     Keep,
 }
 
@@ -199,11 +201,11 @@ pub struct ShDegreeParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum ShDegreeRule {
-    /// SH degree of the input.
+    /// The result keeps the SH degree of the input.
     All,
-    /// Lowest SH degree with which renders of the result hardly change.
+    /// The result gets the lowest SH degree with which its renders hardly change.
     Needed,
-    /// At most this SH degree. Refinement compensates for the dropped coefficients.
+    /// The result has at most this SH degree. Refinement compensates for the dropped coefficients.
     UpTo(usize),
 }
 
@@ -236,10 +238,10 @@ impl From<ShDegreeRule> for String {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FieldPrecision {
-    /// Unchanged from the input, byte for byte.
+    /// The deformation field is copied from the input, byte for byte.
     #[default]
     Exact,
-    /// Half precision (IEEE 754 binary16, 2 bytes per value).
+    /// The deformation field is written in half precision (IEEE 754 binary16, 2 bytes per value).
     Half,
 }
 
@@ -339,11 +341,12 @@ pub enum ProxyPosition {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ProxyOpacity {
-    /// Sum of the opacities α, limited to the valid range.
+    /// Sum of the members' opacities α, limited to the valid range.
     Sum,
     /// 1 − Π(1 − α), the opacity of all members one behind the other.
     Union,
-    /// Σ α·area / (area of the proxy), limited to the valid range.
+    /// Sum of opacity α times projected area over the members, divided by the projected area of the proxy; limited to
+    /// the valid range.
     Area,
 }
 

@@ -63,7 +63,8 @@ impl LinearizedState {
     }
 }
 
-/// Reader of the scratch file with the frame states. Memory: one frame state, and 24 bytes per frame.
+/// Reader of the scratch file that holds the attributes of the Gaussians, and their derivatives, at each frame of the
+/// target views ([`LinearizedState`]). Memory: the state at one frame, and 24 bytes per frame.
 #[derive(Debug)]
 pub(super) struct LinearizedFrames {
     file: Spill,
@@ -84,7 +85,8 @@ struct StoredFrame {
     present: Option<usize>,
 }
 
-/// Writer of the scratch file with the frame states.
+/// Writer of the scratch file that holds the attributes of the Gaussians, and their derivatives, at each frame of the
+/// target views ([`LinearizedState`]).
 pub(super) struct LinearizedFramesWriter {
     file: SpillWriter,
     varying: Attributes,

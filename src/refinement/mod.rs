@@ -86,8 +86,8 @@ pub struct RefineStage {
     /// difference between a Gaussian and the colors that it hides, when Gaussians are ranked for a prune step; see
     /// [`crate::render::RemovalError`].
     pub contrast_floor: f64,
-    /// Maximum number of keyframes of the parameter delta that varies with time, for inputs with explicit frames. With
-    /// 0, parameter deltas are constant in time.
+    /// Maximum number of keyframes of the time-varying delta (values that refinement adds to each frame, interpolated
+    /// between keyframes), for inputs with explicit frames. With 0, all added values are constant in time.
     pub knots: usize,
     /// Fraction of the Gaussians that the user wants to keep; `None` if not given.
     pub target: Option<f64>,
@@ -146,10 +146,10 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. `pixels`:
-    /// number of pixels of a view. `first`: number of Gaussians with which refinement begins. If prune steps remove
-    /// Gaussians, returns the stride for a third of `first` Gaussians, which may be larger; see
-    /// [`RefineStage::stride`].
+    /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. The
+    /// stride follows from `pixels`, the number of pixels of a view, and from a number of Gaussians
+    /// ([`RefineStage::stride`]). This number is `first`, with which refinement begins; or a third of it if prune steps
+    /// remove Gaussians, because fewer Gaussians allow a larger stride.
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
         let fewer = if self.cuts { first / 3 } else { first };
         self.stride(pixels, fewer)

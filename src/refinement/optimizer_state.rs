@@ -45,8 +45,8 @@ pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
 /// the model has a deformation field; otherwise a frame state is always the state at the start plus the delta.
 pub(super) const REEVALUATE_EVERY: usize = 200;
 
-/// Optimizer together with its data: the frame states of the Gaussians left by pruning, at the frames of the target
-/// views, and the delta so far.
+/// Optimizer together with its data: the frame states (attributes at one frame) of the Gaussians left by pruning, at
+/// the frames of the target views, and the delta (change of the parameters since the start of refinement).
 ///
 /// If the model has a deformation field, a frame state is not simply the stored parameters plus a delta. Each state is
 /// then evaluated anew every [`REEVALUATE_EVERY`] steps and extrapolated along its Jacobian in between. Evaluating the
@@ -66,8 +66,9 @@ pub(super) struct OptimizerState<'a> {
     /// Stored parameters, without the delta (change of these parameters) of `constant_optimizer`. Used only if the
     /// model has a deformation field.
     stored: StoredParams,
-    /// Constant delta (change of the stored parameters since the start of refinement) that `stored` and `linearized`
-    /// already include. The total constant delta is this one plus the delta of `constant_optimizer`.
+    /// Part of the constant delta (change of the stored parameters since the start of refinement) that is already
+    /// included in the parameters `stored` and in the frame states `linearized`. The other part is the delta of
+    /// `constant_optimizer`.
     baked_delta: ParamDelta,
     fixed: Vec<bool>,
     /// Settings of optimization steps, without the attributes and SH degrees that the model does not have or whose
@@ -89,7 +90,7 @@ pub(super) struct OptimizerState<'a> {
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
     /// Whether the frame states were evaluated again after `constant_optimizer` (optimizer of the stored parameters)
-    /// was created, which happens at the beginning and in every prune step.
+    /// was created. It is created at the beginning and again in every prune step.
     reevaluated: bool,
 }
 
@@ -173,9 +174,9 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Replaces `constant_optimizer` (optimizer of the stored parameters) by a new one for the Gaussians in
-    /// `linearized`; its delta is 0. Also sets the stride of the training views from the number of these Gaussians (see
-    /// [`Loss::stride`]).
+    /// Replaces the optimizer of the stored parameters, `constant_optimizer`, by a new one for the Gaussians that are
+    /// left; its delta (change of the parameters) is 0. Also sets `stride`, the stride of the rendered pixels of
+    /// training views, according to the number of these Gaussians (see [`Loss::stride`]).
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -299,8 +300,8 @@ impl<'a> OptimizerState<'a> {
         moved.position
     }
 
-    /// Sets the stored parameters to the parameters at the start plus `change`, an earlier result of
-    /// [`OptimizerState::change`] with the same Gaussians, and restarts the optimizer there.
+    /// Sets the stored parameters to the parameters at the start of refinement plus `change`, and restarts the
+    /// optimizer from there. `change` must be an earlier result of [`OptimizerState::change`] with the same Gaussians.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -309,8 +310,9 @@ impl<'a> OptimizerState<'a> {
         self.reevaluate_states()
     }
 
-    /// Adds the delta of `constant_optimizer` to the delta `self.baked_delta` and, if the model has a deformation
-    /// field, to the parameters `self.stored`. Then resets the delta of `constant_optimizer` to 0.
+    /// Moves the delta (change of the stored parameters) of `constant_optimizer` to `self.baked_delta`: adds it there
+    /// and resets it to 0 in the optimizer. If the model has a deformation field, also adds it to `self.stored`, the
+    /// parameters from which the field computes the frame states.
     fn bake_delta(&mut self) {
         if !self.constant_optimizer.has_moved() {
             return;

@@ -188,7 +188,7 @@ struct ResumePoint<Checkpoint, Best> {
 struct BestState<Delta, Trajectory> {
     before: RenderQuality,
     best: RenderQuality,
-    /// Best validation quality so far of renders with the constant delta alone, without time-varying values.
+    /// Best validation quality so far of renders without the trajectory delta (values that vary with time).
     constant: RenderQuality,
     /// Constant delta (values added to the stored parameters) that has had the best validation quality so far.
     delta: Delta,
@@ -205,12 +205,12 @@ struct BestState<Delta, Trajectory> {
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct MeanDelta<Delta> {
     delta: Delta,
-    /// Number of steps over which the mean is taken so far.
+    /// Number of parameter deltas of which `delta` is the mean so far.
     count: u32,
 }
 
 impl MeanDelta<ParamDelta> {
-    /// Updates the mean with `next`, the values that refinement adds to the parameters after one more step.
+    /// Includes `next` in the mean: the values that refinement adds to the parameters after one more step.
     fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;
         let part = 1.0 / self.count as f32;
@@ -320,8 +320,8 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs the final optimization steps on the model `reduction`. Returns this model with the added values that have
-    /// given the best validation quality.
+    /// Runs the final optimization steps on the model `reduction`. Returns this model with the parameter deltas (values
+    /// that refinement adds) that have given the best validation quality.
     pub(crate) fn refine_best(
         &mut self,
         mut reduction: CompressedModel,
@@ -528,9 +528,9 @@ impl<'a> RefineRun<'a> {
         Ok(best_state)
     }
 
-    /// Runs the optimization steps of the time-varying delta, which follow the `steps` steps of the constant delta.
-    /// Stores the best deltas in `best_state`. `done`: number of steps of both deltas in the loaded checkpoint; 0
-    /// without a checkpoint.
+    /// Runs the optimization steps of the time-varying delta (values added to each frame). They follow the `steps`
+    /// steps of the constant delta (values added to the stored parameters). Stores the best deltas in `best_state`.
+    /// `done`: number of steps of both deltas in the loaded checkpoint; 0 without a checkpoint.
     /// - If `done` is above `steps`, continues from the checkpoint with the learning rates `schedule`.
     /// - Otherwise starts from the best constant delta.
     ///

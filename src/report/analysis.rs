@@ -1,4 +1,4 @@
-//! Comparison of one compressed model with the original, with everything that the report page shows of it.
+//! Comparison of one compressed model with the original: scores, renders and animations that the report page shows.
 
 use super::film::FilmPanel;
 use super::findings::{ResultData, WorstPlaceImages};

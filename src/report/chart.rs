@@ -91,7 +91,8 @@ pub struct StackedHistogram {
     pub x: ChartAxis,
     /// Edges of the bins in increasing order; one more than there are bins.
     pub edges: Vec<f64>,
-    /// Groups from bottom to top, each with its name and its count in every bin.
+    /// Groups whose counts are stacked in every bin, from bottom to top: the name of the group, and its count in each
+    /// bin.
     pub groups: Vec<(String, Vec<usize>)>,
 }
 

@@ -118,8 +118,8 @@ fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> 
     out + &format!("</div>\n<p class=\"caption\">{}{shrunk}</p>\n</figure>\n", scores(shown))
 }
 
-/// Returns a remark for the reader of the page that shown images have fewer pixels than the render: each shown pixel
-/// stands for `shrunk` × `shrunk` pixels. Empty if `shrunk` is 1.
+/// Returns a remark for the caption of scaled-down images, in which each pixel stands for `shrunk` × `shrunk` pixels of
+/// the render. Returns an empty text if `shrunk` is 1.
 fn at_size(shrunk: u32) -> String {
     match shrunk {
         1 => String::new(),

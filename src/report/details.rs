@@ -195,8 +195,9 @@ fn stages(run: &RunFiles) -> String {
     out + &format!("<div class=\"charts\">\n{seconds}{memory}</div>\n")
 }
 
-/// Returns a bar chart, with the caption `title` and the axis label `label`, of the values that `value` returns for the
-/// stages of the run. Returns an empty text if fewer than two stages have a value.
+/// Returns a bar chart with one bar per stage of the run that wrote the compressed model. `value` returns the value of
+/// a stage, if it has one. `title`: caption of the chart. `label`: axis label. Returns an empty text if fewer than two
+/// stages have a value.
 fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&StageRecord) -> Option<f64>) -> String {
     let bars: Vec<(String, f64)> =
         summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();

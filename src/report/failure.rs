@@ -39,7 +39,8 @@ pub const CROP_SIDE_PX: u32 = 64;
 pub struct ViewErrorSums {
     /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`].
     kinds: [FailureSums; 3],
-    /// Sum over pixels of e², the squared difference of the two renders, averaged over color channels.
+    /// Sum over pixels of e²: the squared difference between the renders of the two models, averaged over color
+    /// channels.
     error: f64,
     pixels: f64,
 }
@@ -48,7 +49,8 @@ pub struct ViewErrorSums {
 struct FailureSums {
     /// Sum over pixels of w, the share of one kind of Gaussian in the pixel.
     weight: f64,
-    /// Sum over pixels of w e²: the share w of one kind of Gaussian, times the squared difference e² of the renders.
+    /// Sum over pixels of w e²: the share w of one kind of Gaussian in the pixel, times the squared difference e²
+    /// between the renders of the two models.
     error: f64,
     /// Sum over pixels of w ∇c·∇o. Here w is the share of one kind of Gaussian in the pixel, and c and o are the
     /// brightness of the compressed and of the original render. The field `detail` is the sum of w ∇o·∇o.
@@ -86,7 +88,7 @@ pub struct WorstPlace {
     pub frame: usize,
     /// Number of the view that the render shows.
     pub view: u32,
-    /// PSNR of this render where the kind of Gaussian is visible, dB.
+    /// PSNR of this render, dB, where the kind of Gaussian that the failure mode concerns is visible.
     pub psnr: f64,
 }
 
@@ -127,7 +129,8 @@ pub struct FailureMode {
     /// Lost fraction of the original's brightness gradients where this kind of Gaussian is visible; negative if the
     /// compressed model exaggerates the gradients. `None` if the original has no gradients there.
     pub detail_lost: Option<f64>,
-    /// Render in which the failure mode is worst; `None` if the kind cannot be judged in any render.
+    /// Render in which the damage to this kind of Gaussian is worst; `None` if the damage cannot be judged in any
+    /// render.
     pub worst: Option<WorstPlace>,
 }
 
@@ -146,8 +149,10 @@ pub struct KindTotals {
     pub shares: (f64, f64),
 }
 
-/// Renders the Gaussians `state` with colors that encode their kinds (`traits`), and returns the image. Red, green and
-/// blue of a pixel are the shares (Σ alpha · transmittance) of the three kinds in it.
+/// Renders an image that shows where each kind of Gaussian is visible. Red, green and blue of a pixel are the shares (Σ
+/// alpha · transmittance) of the three kinds in [`GaussianKind::ALL`]: fast, thin, changing in appearance.
+/// - `state`: all Gaussians of the original at one frame
+/// - `traits`: for each Gaussian, the kinds to which it belongs
 pub fn render_kind_shares(state: &Gaussians, traits: &[KindFlags], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
@@ -164,8 +169,11 @@ pub fn render_kind_shares(state: &Gaussians, traits: &[KindFlags], camera: &Came
     render(&marked, camera, [0.0; 3])
 }
 
-/// Returns the error sums of one view, for each kind of Gaussian. `taken` has the renders of both models, `state` the
-/// original's Gaussians, `traits` their kinds.
+/// Returns the squared error between the renders of both models in one view, summed over its pixels: in total, and for
+/// each kind of Gaussian (fast, thin or changing in appearance).
+/// - `state`: Gaussians of the original at the frame of the view
+/// - `traits`: for each Gaussian, the kinds to which it belongs
+/// - `taken`: renders of both models
 ///
 /// # Panics
 /// Panics if the sizes of the two renders and of the camera's images differ.

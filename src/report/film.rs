@@ -37,24 +37,26 @@ pub const JPEG_QUALITY: u8 = 80;
 /// Animation of one view on the report page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FilmPanel {
-    /// Reasons for the choice of this view, such as "worst render".
+    /// Reasons why this view is shown as an animation, such as "worst render".
     pub why: Vec<String>,
     /// Number of the animated view.
     pub view: u32,
     /// Index of the frame from which the camera of the animation is taken. All frames are rendered from this camera,
     /// even if the camera of the view moves.
     pub camera_of_frame: usize,
-    /// Numbers of the frames that the animation shows, in order.
+    /// Indices of the frames that the animation shows, in order.
     pub frames: Vec<usize>,
     /// PSNR of the full-size render, compressed against original, at each shown frame, dB.
     pub psnr: Vec<f64>,
     /// Data URIs of the original, the compressed and the difference image of each shown frame.
     #[serde(skip)]
     pub images: Vec<[String; 3]>,
-    /// Width and height of the shown images, pixels.
+    /// Width and height of the images of the original and the compressed model, pixels. Difference images may be
+    /// smaller.
     #[serde(skip)]
     pub size: (u32, u32),
-    /// Number of render pixels along each axis that one shown pixel stands for.
+    /// Number of render pixels along each axis that one pixel of the images of the original and the compressed model
+    /// stands for.
     #[serde(skip)]
     pub shrunk: u32,
     /// Factor by which the difference images are brightened.
@@ -65,8 +67,8 @@ pub struct FilmPanel {
 /// Names of the three images of each frame, in the order of [`FilmPanel::images`].
 pub const IMAGE_NAMES: [&str; 3] = ["original", "compressed", "difference"];
 
-/// Returns the number of bytes of memory for the animations, and for the page that contains them. Each of the two is
-/// estimated at one byte per pixel.
+/// Returns the estimated bytes of memory for the animations and for the page that contains them, in total: one byte per
+/// pixel for each of the two.
 pub fn memory_bytes(work: &Workload) -> u64 {
     let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)

@@ -56,7 +56,8 @@ pub struct ResultData {
     pub histograms: Option<Vec<Histogram>>,
     /// Content of the file `summary.json` of the run that wrote the compressed model, if it was found.
     pub run: Option<serde_json::Value>,
-    /// One text for each file that was not found beside the compressed model: its name, and the reason.
+    /// One text for each file of `compress` that is absent beside the compressed model or cannot be used: its name, and
+    /// the reason.
     pub missing: Vec<String>,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -70,10 +71,10 @@ pub struct ResultData {
 pub(super) struct WorstPlaceImages {
     /// Index of the failure mode in [`ResultData::failure_modes`].
     pub(super) mode: usize,
-    /// Upper left pixel of the square in the render.
+    /// Column and row, in the full render, of the upper left pixel of the square where the failure mode is worst.
     pub(super) corner: (u32, u32),
-    /// PSNR of the square, compressed against original, dB.
+    /// PSNR in dB of the compressed model against the original, inside the square where the failure mode is worst.
     pub(super) psnr: f64,
-    /// Data URIs of the two images of the square: original, compressed.
+    /// Data URIs of two images of the square where the failure mode is worst: the original, then the compressed model.
     pub(super) images: [String; 2],
 }

@@ -20,9 +20,9 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 /// Minimum trajectory magnitude D (root mean square step from frame to frame) of a fast Gaussian, as a fraction of the
 /// scene extent. It is one pixel per frame in a render that shows the scene over 500 pixels.
 pub const MIN_FAST_MOTION: f64 = 2e-3;
-/// Minimum change of the distances between a Gaussian and its neighbors that counts as non-rigid motion. For one
-/// neighbor, the change is relative to the distance, as root mean square over time. The lower median over the neighbors
-/// must reach this value.
+/// Minimum non-rigid motion of a fast Gaussian. Non-rigid motion is measured by the distances to neighboring Gaussians:
+/// - For one neighbor, it is the root mean square change of the distance over time, relative to the distance.
+/// - For a Gaussian, it is the lower median of the values for its neighbors.
 pub const MIN_NON_RIGID_CHANGE: f64 = 0.05;
 /// Minimum divisor, as a fraction of the scene extent, in the relative change of the distance between two neighbors.
 /// The change is divided by the distance or by this minimum, whichever is larger. Without the minimum, invisible small
@@ -42,7 +42,8 @@ pub const MIN_OPACITY_CHANGE: f64 = 0.05;
 /// the Gaussian is alive (opacity ≥ alpha_min), root mean square over the channels, colors in [0, 1]. It is five steps
 /// of 1/255.
 pub const MIN_COLOR_CHANGE: f64 = 0.02;
-/// Maximum number of frames at which distances and colors are measured. They are evenly spaced.
+/// Maximum number of frames at which distances to neighbors, and colors, of Gaussians are measured. The frames are
+/// evenly spaced.
 pub const MAX_SAMPLED_FRAMES: usize = 24;
 
 /// Kind of Gaussian that compression is known to damage.
@@ -114,9 +115,12 @@ pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> 
     Ok(found)
 }
 
-/// Returns two fractions for each kind of Gaussian. First: the contribution of the kind to renders, divided by the
-/// contribution of all Gaussians. Second: the contribution of the Gaussians of this kind for which `is_lost` is true,
-/// divided by the contribution of the kind. `traits` has the kinds of every Gaussian.
+/// Returns two fractions for each kind of Gaussian (fast, thin, changing in appearance), in this order:
+/// - the contribution of the kind to renders, divided by the contribution of all Gaussians
+/// - the contribution of the Gaussians of this kind for which `is_lost` is true, divided by the contribution of the
+///   kind
+///
+/// `traits` states for every Gaussian to which kinds it belongs. The argument of `is_lost` is the index of a Gaussian.
 pub fn contribution_shares(
     rows: &StatisticRows,
     traits: &[KindFlags],

@@ -53,10 +53,10 @@ pub struct Histogram {
     pub log: bool,
     /// Edges of the bins in increasing order, one more than there are bins; empty if no value is positive.
     pub edges: Vec<f64>,
-    /// Numbers of Gaussians, per fate and per bin. A bin includes its lower edge, the last bin also its upper edge; the
-    /// first bin also has smaller positive values.
+    /// Numbers of kept, merged and dropped Gaussians in each bin. A bin includes its lower edge, the last bin also its
+    /// upper edge. The first bin also has the positive values below its lower edge.
     pub bins: ByFate<Vec<usize>>,
-    /// Numbers of Gaussians, per fate, whose value is not positive or not finite.
+    /// Numbers of kept, merged and dropped Gaussians whose value is not positive or not finite.
     pub zero: ByFate<usize>,
 }
 

@@ -313,9 +313,12 @@ fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -
     })
 }
 
-/// Renders again the views of `choices`, and for each failure mode of `modes` the view in which its damage is worst.
-/// Returns two lists: the images of each of `choices`, and for each failure mode the images of a square around the
-/// worst damage. Failure modes without a worst view are left out. `traits` has the kinds of every Gaussian.
+/// Renders some views again to show them on the page: the views of `choices`, and for each failure mode of `modes` the
+/// view in which its damage is worst. Returns two lists:
+/// - the images of each element of `choices`
+/// - for each failure mode that has such a view, the images of a square around the worst damage
+///
+/// `traits` states for every Gaussian to which kinds (fast, thin, changing in appearance) it belongs.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],

@@ -31,8 +31,8 @@ fn wrapped(charts: String) -> String {
     if charts.is_empty() { charts } else { format!("<div class=\"charts\">\n{charts}</div>\n") }
 }
 
-/// Returns the HTML of a chart of one quality measure, which `value` returns, over the frames; empty for fewer than two
-/// frames. `title` is its caption, and `label` its axis label.
+/// Returns the HTML of a chart of one quality measure over the frames; empty for fewer than two frames. `value` returns
+/// the measure from the mean scores of a frame. `title`: caption of the chart. `label`: axis label of the measure.
 fn by_frame(
     results: &[Analysis],
     names: &[String],

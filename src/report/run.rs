@@ -32,13 +32,15 @@ pub enum Fate {
 /// Files of `compress` that were found beside a compressed model and belong to it.
 #[derive(Debug, Default)]
 pub struct RunFiles {
-    /// Summary of the run, parsed and as the whole JSON content of its file.
+    /// Summary of the `compress` run that wrote the compressed model: parsed, and as the whole JSON content of its
+    /// file.
     pub summary: Option<(Summary, Value)>,
-    /// Recipe (parameters) of the run.
+    /// Recipe (parameters) of the `compress` run that wrote the compressed model.
     pub recipe: Option<Recipe>,
-    /// Fate of every Gaussian of the original (kept, merged or dropped), from the index map.
+    /// Fate of every Gaussian of the original (kept, merged or dropped), from the index map (file that maps input to
+    /// output Gaussians).
     pub fates: Option<Vec<Fate>>,
-    /// One text for each file that was not used: its name, and the reason.
+    /// One text for each file of `compress` that is absent or cannot be used: its name, and the reason.
     pub missing: Vec<String>,
 }
 

@@ -36,7 +36,7 @@ const MAX_FACTOR: u32 = 64;
 /// Render that is chosen for the page, with its scores.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ChosenRender {
-    /// Reasons for the choice, such as "worst render".
+    /// Reasons why this render is shown on the page, such as "worst render".
     pub why: Vec<String>,
     /// Index of the render in [`Evaluation::views`].
     #[serde(skip)]
@@ -168,7 +168,7 @@ pub(super) fn brighter(image: &Image, factor: u32) -> Image {
 }
 
 /// Returns the factor by which the image `difference` is brightened: the largest power of two, at most [`MAX_FACTOR`],
-/// for which at most the fraction 1 − [`UNCLIPPED`] of its values exceeds 1.
+/// with which at most the fraction 1 − [`UNCLIPPED`] of the brightened values exceeds 1.
 fn brightening(difference: &Image) -> u32 {
     let mut values = difference.data.clone();
     if values.is_empty() {

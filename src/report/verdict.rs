@@ -16,7 +16,8 @@ const WORDS: [(f64, &str); 6] = [
     (f64::NEG_INFINITY, "no longer looks like the original"),
 ];
 
-/// Returns the verdict: how much smaller the model is, how visible the loss is, and which failure modes show.
+/// Returns the verdict in two or three sentences: how much smaller the compressed model is, how visible its differences
+/// from the original are, and which kinds of Gaussian are visibly damaged.
 pub(super) fn verdict(found: &Evaluation, modes: &[FailureMode]) -> String {
     let mean = found.loss.overall;
     let of = |part: u64, whole: u64| percent(part as f64, whole as f64);

@@ -128,7 +128,7 @@ impl Scene {
     }
 
     /// Applies the memory plan `plan`: sets the limits for passes over this scene, and lets the input keep decoded
-    /// tiles in memory if the plan says so.
+    /// tiles (separately compressed parts of a container) in memory if the plan says so.
     pub fn apply_plan(&mut self, plan: &MemoryPlan) {
         self.limits = plan.limits;
         self.planned_reads = Some(plan.full_reads());

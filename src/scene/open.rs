@@ -70,8 +70,8 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
 /// Loads the cameras that `options` name, or else the cameras found with `input`. Returns `None` if there are neither.
 /// The times in a camera file may be normalized or on the scale of the frames' time stamps:
 /// - First, they are read in the time convention of the input.
-/// - If the frames of the input have time stamps and the times read are not among them, the times are used as stated in
-///   the file, provided that these are among the time stamps.
+/// - If the frames of the input have time stamps and the resulting times are not among them, the times as stated in the
+///   file are tried. They are used if they are among the time stamps.
 fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
     let path = camera_path(options, input);
     // Numbers in the image names of a still scene are not times.

@@ -18,11 +18,11 @@ pub struct Photographs {
 }
 
 impl Photographs {
-    /// Creates the list from pairs of a view and the path of its photograph. `folder`, in which all photographs lie, is
-    /// named in errors.
+    /// Creates the list of photographs from pairs of a view and the path of its photograph. `folder`, which contains
+    /// all photographs, is named in error messages.
     ///
     /// # Errors
-    /// Fails if two views have the same photograph, or with the first error in `found`.
+    /// Fails if two views have the same photograph, or if an item of `found` is an error.
     fn from_files(folder: &Path, found: impl Iterator<Item = Result<(FrameView, PathBuf)>>) -> Result<Photographs> {
         let mut files = HashMap::new();
         let mut view_of_file: HashMap<PathBuf, FrameView> = HashMap::new();

@@ -47,8 +47,8 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 /// container.
 ///
 /// # Errors
-/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
-/// of the container).
+/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
+/// that the container stores together).
 pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> {
     let rig =
         load_cameras(options, options.cameras.as_deref(), options.times.clone(), TimeConvention::Normalized, None)?;
@@ -62,8 +62,8 @@ pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> 
 /// Packs a stream of frames into a temporary container file and opens this file.
 ///
 /// # Errors
-/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
-/// of the container).
+/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
+/// that the container stores together).
 fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<ReceivedStream> {
     let mut quota = frame_quota(options, stream.header())?;
     ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
@@ -79,8 +79,8 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
 /// streams for which [`is_linked`] returns true. Returns the input together with the cameras `rig`.
 ///
 /// # Errors
-/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
-/// of the container).
+/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
+/// that the container stores together).
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<OpenedInput> {
     let joins = options.link.joins_tracks();
     let input = match stream.header().is_unlinked {
@@ -102,7 +102,8 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
 /// soon as there are more than can be packed within the memory budget.
 ///
 /// # Errors
-/// Fails if the memory budget is too small for one block of frames (the frames in a tile of the container).
+/// Fails if the memory budget is too small for one block of frames (consecutive frames that the container stores
+/// together).
 pub fn frame_quota(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
     let block = frames_per_tile(header);
     let held = (block + PREFETCH_FRAMES) as u64;
@@ -131,8 +132,9 @@ pub struct FrameQuota {
 }
 
 impl FrameQuota {
-    /// Creates a quota for `budget`, and finds the maximum number of frames that fit. `peak(limit, frames)` returns the
-    /// memory in bytes that a run takes for a stream of `frames` frames if its budget is `limit` bytes.
+    /// Creates a counter of arriving frames, and finds the maximum number of frames with which a run stays within
+    /// `budget`, the memory budget. `peak(limit, frames)` returns the memory in bytes that a run takes for a stream of
+    /// `frames` frames if its budget is `limit` bytes.
     pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> FrameQuota {
         let bytes = budget.limit();
         // Finds the number bit by bit; a stream has fewer than 2^32 frames.

@@ -8,9 +8,9 @@ use crate::model::Camera;
 /// Smallest distance of a new camera from either of the two cameras between which it is placed, as a fraction of the
 /// path between these two.
 const MIN_FRACTION: f64 = 0.15;
-/// Smallest cosine of the angle between two cameras, seen from the point where the optical axes meet, for a new camera
-/// to be placed between them: angles up to about 127° are allowed. Halfway between opposite cameras, the viewing
-/// direction would be undefined.
+/// Limit for placing a new camera between two cameras: the cosine of the angle between their directions, as seen from
+/// the point where the optical axes meet, must be above this value. So the angle is at most about 127°. Halfway between
+/// opposite cameras, the viewing direction would be undefined.
 const MIN_COSINE: f64 = -0.6;
 
 /// Returns `count` new cameras, each at a random place on a path between two of `cameras`. Along a path, rotation and

@@ -26,8 +26,8 @@ const TRIES: usize = 64;
 /// Each iteration adds the direction of one camera to a weighted sum that approaches the given direction.
 const MAX_DIRECTIONS: usize = 64;
 /// Tolerance of [`RigCone::angle`], which searches a cone for the direction nearest to a given one. It has two uses:
-/// - The search ends if no direction of the cone has a dot product above this value with the remainder. The remainder
-///   is the given direction minus the nearest point of the cone found so far.
+/// - The search ends if the remainder (given direction minus the nearest point of the cone found so far) has a dot
+///   product of at most this value with every camera direction of the cone.
 /// - Vectors count as linearly dependent if the absolute value of their determinant is at most this value.
 const EXACT_ENOUGH: f64 = 1e-12;
 /// Tolerance for the faces of a cone, with two uses:

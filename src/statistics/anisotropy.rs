@@ -10,7 +10,8 @@ use crate::recipe::Anisotropy;
 /// raised to it, because renders do not show how much flatter a disc is.
 const SCALE_FLOOR: f64 = 1e-7;
 
-/// Upper limit of the logarithm of a ratio of scales: e⁷⁰⁰ ≈ 1e304 is close to the largest f64.
+/// Upper limit of ln(s_max / s_min), where s_max and s_min are the largest and the smallest scale of a Gaussian: e⁷⁰⁰ ≈
+/// 1e304 is close to the largest f64.
 const MAX_LOG_RATIO: f64 = 700.0;
 
 /// Fills the anisotropy `rows.e` from `log_scale` (`[3, N]`, natural logs of the scales in scene units).

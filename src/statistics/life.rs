@@ -17,8 +17,8 @@ pub(super) struct LifeSpans {
     frames: Vec<u32>,
     /// Number of Gaussians alive (opacity ≥ alpha_min) in the frame that was added last.
     alive: u32,
-    /// Number of frames with the opacities of the first frame that [`LifeSpans::repeat_frame`] has received and that
-    /// are not counted in `frames` yet.
+    /// Number of frames, added by [`LifeSpans::repeat_frame`], that are not counted in `frames` yet. Their opacities
+    /// equal those of the first frame.
     repeats: u32,
 }
 
@@ -36,8 +36,9 @@ impl LifeSpans {
         }
     }
 
-    /// Adds a frame of opacities in [0, 1] and returns how many Gaussians are alive in it: those with an opacity of at
-    /// least `alpha_min`.
+    /// Adds the next frame to the running sums and to the numbers of frames in which Gaussians are alive. `opacity`
+    /// holds the opacity of every Gaussian, in [0, 1]. Returns how many Gaussians are alive in this frame: those with
+    /// an opacity of at least `alpha_min`.
     #[inline(always)]
     pub(super) fn add_frame(&mut self, opacity: &[f64], alpha_min: f64) -> u32 {
         self.count_repeats();

@@ -48,7 +48,8 @@ pub(super) struct MotionSums {
     /// (opacity ≥ alpha_min). It is added to `sum_turn` only if the Gaussian is alive in a later frame. Used only by
     /// `MotionParams::Literal`.
     pending: Vec<f64>,
-    /// Number of steps summed in `sum_step2`; `turns` is the number of turns summed in `sum_turn`. Used only by
+    /// Number of steps (changes of position from frame to frame) whose squares are summed in `sum_step2`. The field
+    /// `turns` counts the turns (second differences of position) summed in `sum_turn`. Used only by
     /// `MotionParams::Runs`; `MotionParams::Literal` divides by numbers that follow from the life span instead.
     steps: Vec<u32>,
     turns: Vec<u32>,
@@ -136,9 +137,9 @@ impl MotionSums {
         }
     }
 
-    /// Adds the next frame by the definition `Runs` of motion if its opacities equal the opacities of all earlier
-    /// frames. The result is the same as with [`MotionSums::add_frame_of_runs`]. The steps and turns that count are
-    /// known without reading the history, so half as much memory is accessed (`cargo bench --bench scan`).
+    /// Has the same result as [`MotionSums::add_frame_of_runs`], for a frame whose opacities equal the opacities of all
+    /// earlier frames. The same Gaussians are then alive in all frames, so the history of each Gaussian is not needed,
+    /// and half as much memory is accessed (`cargo bench --bench scan`).
     #[inline(always)]
     fn add_steady_frame<const EVEN: bool>(&mut self, position: &AttributeValues, steps: [f64; 2]) {
         self.steady += 1;
@@ -153,9 +154,9 @@ impl MotionSums {
         }
     }
 
-    /// Adds the frames counted in `steady` to the numbers of steps and turns of each Gaussian that is alive (opacity ≥
-    /// alpha_min) in them. The other Gaussians have not been alive in any frame yet, so their sums of steps and turns
-    /// are set to 0. Must be called before results are read.
+    /// Counts the frames in `steady`, in which no opacity has changed: adds them to the numbers of steps and turns of
+    /// each Gaussian that is alive (opacity ≥ alpha_min) in them. The other Gaussians have not been alive in any frame
+    /// yet, so their sums of steps and turns are set to 0. Must be called before results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
@@ -197,18 +198,20 @@ impl MotionSums {
         }
     }
 
-    /// Returns the trajectory magnitude D of every Gaussian: the root mean square of its steps from frame to frame, in
-    /// scene units per frame. The table of this module defines which steps count; D is 0 if none does. `life` holds the
-    /// number of frames in which each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by it.
+    /// Returns the trajectory magnitude D of every Gaussian: the root mean square of its steps (changes of position
+    /// from frame to frame), in scene units per frame. A step counts only if the Gaussian is alive (opacity ≥
+    /// alpha_min) in the second of its frames and, with the definition `Runs`, also in the first. D is 0 if no step
+    /// counts. `life` holds the number of frames in which each Gaussian is alive; the definition `Literal` divides by
+    /// it.
     pub(super) fn magnitude(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i] } else { self.steps[i] };
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
     }
 
     /// Returns the curvature κ of every Gaussian: the mean length of its turns (second differences of its positions),
-    /// in scene units per frame². The table of this module defines which turns count; κ is 0 if none does. `life` holds
-    /// the number of frames in which each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by
-    /// `life` − 2.
+    /// in scene units per frame². A turn about a frame counts only if the Gaussian is alive (opacity ≥ alpha_min) in
+    /// this frame; the table in the module documentation has further conditions. κ is 0 if no turn counts. `life` holds
+    /// the number of frames in which each Gaussian is alive; the definition `Literal` divides by `life` − 2.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()

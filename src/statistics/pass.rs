@@ -18,7 +18,7 @@ use crate::source::{FrameSource, Ids};
 use crate::statistics::pass::blocks::BlockScans;
 use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan, attributes_to_read};
 
-/// Statistics that a scan has computed.
+/// Result of a scan, the pass over all frames that computes the statistics of every Gaussian.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct ScanResult {
     /// Statistics, one row per Gaussian. The trajectory magnitude D and the curvature κ still include rounding noise;
@@ -80,7 +80,8 @@ impl ScanResult {
     ///
     /// - Life spans grow in proportion to the number of frames.
     /// - The number of Gaussians alive (opacity ≥ alpha_min) is 0 in frames that were not read.
-    /// - D, κ and V become 0, because steps between the frames that were read are not the steps of the sequence.
+    /// - The trajectory magnitude D, the curvature κ and the opacity variance V become 0, because steps between the
+    ///   frames that were read are not the steps of the sequence.
     pub fn extrapolate_to_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
         let mut alive_per_frame = vec![0; all];
         frames.iter().zip(&self.alive_per_frame).for_each(|(&frame, &alive)| alive_per_frame[frame] = alive);
@@ -125,7 +126,7 @@ pub struct RunningScan<'a> {
 }
 
 impl<'a> RunningScan<'a> {
-    /// Creates a scan of `count` Gaussians that has no frames yet.
+    /// Creates a scan (running statistics) of `count` Gaussians, to which no frame has been added yet.
     pub fn new(count: usize, plan: &'a ScanPlan) -> Self {
         let block = |start: usize| BlockScan::new(GAUSSIANS_PER_BLOCK.min(count - start), start, plan);
         RunningScan {

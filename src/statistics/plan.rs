@@ -14,22 +14,23 @@ const EVEN_TOLERANCE: f64 = 1e-2;
 /// two steps; its square must not overflow.
 const LEAST_STEP: f64 = 1e-50;
 
-/// Number of bits of the largest contribution that a Gaussian can have in one (frame, view) pair, as a fixed-point
-/// number. [`super::projection`] rounds by adding 2⁵², so a contribution must stay below 2⁵²; one bit is kept in
+/// Number of bits, in fixed point, of the largest contribution (covered pixels times opacity) that a Gaussian can have
+/// in one view. [`super::projection`] rounds by adding 2⁵², so a contribution must stay below 2⁵²; one bit is kept in
 /// reserve.
 const CONTRIBUTION_BITS: i32 = 51;
 
-/// Number of contributions that fit into a u64 sum before its high bits must be moved to another counter: 2¹²
-/// contributions of at most 2⁵¹, with one bit in reserve.
+/// Number of contributions (covered pixels times opacity in one view, in fixed point) that are added to a u64 sum
+/// before its high bits must be moved to another counter: 2¹² contributions of at most 2⁵¹, with one bit in reserve.
 pub(super) const PAIRS_PER_CARRY: usize = 1 << 12;
 
-/// Parameters of the scan of any block of Gaussians; all blocks of a sequence use the same plan.
+/// Parameters of the scan, the pass over all frames that computes the statistics of the Gaussians. The Gaussians are
+/// scanned in blocks, and all blocks of a sequence use the same parameters.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScanPlan {
     pub(super) alpha_min: f64,
     pub(super) motion: MotionParams,
-    /// For each frame t the duration of the time step into it, divided by the mean duration; empty if frames are evenly
-    /// spaced.
+    /// For each frame t, the duration of the time step from frame t − 1 to frame t, divided by the mean duration. Empty
+    /// if frames are evenly spaced or the recipe ignores time stamps ([`MotionParams::Literal`]).
     pub(super) steps: Vec<f64>,
     pub(super) frames: usize,
     #[serde(rename = "pairs")]

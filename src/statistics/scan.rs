@@ -70,7 +70,8 @@ pub struct BlockStatistics {
 }
 
 impl<'a> BlockScan<'a> {
-    /// Creates a scan, without frames yet, of the Gaussians with the ids `first_id .. first_id + len`.
+    /// Creates the running statistics, without frames yet, of the Gaussians with the ids `first_id .. first_id + len`.
+    /// `plan`: parameters of the scan.
     pub fn new(len: usize, first_id: usize, plan: &'a ScanPlan) -> Self {
         BlockScan {
             plan,

@@ -18,11 +18,11 @@ pub(super) const CHUNK: usize = 256;
 pub(super) struct BlockState {
     /// Opacity in [0, 1].
     pub(super) opacity: Vec<f64>,
-    /// Matrix R·S (rotation times scales) of each Gaussian: entry (row, axis) is in array 3·row + axis. Valid as of the
-    /// last update of the Gaussian's chunk.
+    /// Matrix R·S (rotation times scales) of each Gaussian: entry (row, axis) is in array 3·row + axis.
+    /// [`BlockState::update_axes`] updates it, one chunk of [`CHUNK`] Gaussians at a time, before it is used.
     pub(super) axes: [Vec<f64>; 9],
-    /// For each chunk of Gaussians, whether rotations or scales have changed since the axes (rotation times scales)
-    /// were computed.
+    /// For each chunk of [`CHUNK`] Gaussians, whether rotations or scales have changed since the axes (rotation times
+    /// scales) were computed.
     axes_outdated: Vec<bool>,
     pub(super) flags: Vec<AnomalyFlags>,
     /// Largest finite |coordinate| of the positions so far, scene units.

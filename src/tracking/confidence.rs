@@ -5,8 +5,8 @@ use super::appearance::ComparedAppearance;
 use super::links::Links;
 use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Maximum fraction of the links of a frame that may be wrong, as an expected value. If more are expected to be wrong,
-/// the least certain links are removed.
+/// Maximum expected fraction of wrong links among the links of a frame. If more are expected to be wrong, the least
+/// certain links are removed.
 pub(super) const MAX_WRONG: f64 = 0.005;
 /// Cost that is added to the numerator and to the denominator of each ratio of link costs (distance and difference in
 /// appearance of linked Gaussians). As a result, two costs that differ by less than this count as equal.
@@ -21,12 +21,13 @@ pub(super) struct LinkConfidence {
     expected_wrong: f64,
     /// Probability and track number of each link that is wrong with a probability above [`MAX_WRONG`].
     doubtful: Vec<(f32, u32)>,
-    /// Ratio R of each track (Gaussian followed through frames); 0 for a track without a rival. A rival is another
-    /// track or another Gaussian that could take one end of the track's link.
+    /// For each track (Gaussian followed through frames), a ratio R that measures how doubtful its link to a Gaussian
+    /// of the frame is: the larger R, the more likely the link is wrong.
     ///
-    /// R is the cost (distance and difference in appearance) of the present links, divided by their cost after the link
-    /// and the link of the rival exchange their Gaussians. With several rivals, the largest R counts. The larger R is,
-    /// the more likely the link is wrong.
+    /// A rival is another Gaussian that could continue the track, or another track that could continue with its
+    /// Gaussian. R is the cost (distance and difference in appearance) of the links as made, divided by their cost
+    /// after an exchange: the track gets the rival Gaussian, or the rival track gets its Gaussian. With several rivals,
+    /// the largest R counts. Without a rival, R is 0.
     ratios: Vec<f32>,
 }
 
@@ -35,8 +36,8 @@ impl LinkConfidence {
         LinkConfidence { expected_wrong: 0.0, doubtful: Vec::new(), ratios: vec![0.0; tracks] }
     }
 
-    /// Adds the links between tracks (Gaussians followed through frames) and Gaussians that one round of linking made
-    /// to the estimates.
+    /// Updates the estimates by the links that one round of linking has made between tracks (Gaussians followed through
+    /// frames) and Gaussians.
     ///
     /// - `candidates_by_track`: for each track that took part in the round, the Gaussians that might have continued it.
     /// - `tracks` and `appearances`: all open tracks, and the appearances of all Gaussians of the frame.

@@ -68,13 +68,14 @@ impl CellGrid {
         CellGrid { reach, mask, starts, cells, entries }
     }
 
-    /// Calls `visit` with the number and the appearance of every Gaussian that satisfies two conditions:
+    /// Calls `visit` with the number and the appearance of every Gaussian in the grid cells where similar Gaussians may
+    /// lie. These cells contain all Gaussians that satisfy two conditions, and also others:
     ///
-    /// - its size is that of `appearance` within a factor of √2;
-    /// - its position differs from `center` by at most `radius` (scene units) along each axis.
+    /// - The size is that of `appearance` within a factor of √2.
+    /// - The position differs from `center` by at most `radius` (scene units) along each axis.
     ///
-    /// Other Gaussians in the visited cells are passed to `visit` too. In a cell with more than 64 Gaussians, only the
-    /// 64 with the nearest brightness are visited.
+    /// In a cell with more than 64 Gaussians, only the 64 with the brightness nearest to that of `appearance` are
+    /// visited.
     pub(super) fn for_each_near(
         &self,
         appearance: &ComparedAppearance,
@@ -128,8 +129,8 @@ impl CellGrid {
     }
 }
 
-/// Returns the octaves of sizes that contain all sizes within a factor of √2 of the size with the natural log
-/// `ln_size`.
+/// Returns the octaves that contain all sizes within a factor of √2 of the size with the natural log `ln_size`. Octave
+/// k has the sizes from 2ᵏ to 2ᵏ⁺¹ scene units.
 fn levels(ln_size: f32) -> RangeInclusive<i64> {
     let octave = f64::from(ln_size) / std::f64::consts::LN_2;
     floor(octave - 0.5)..=floor(octave + 0.5)

@@ -4,12 +4,14 @@
 use super::appearance::ComparedAppearance;
 use crate::model::Gaussians;
 
-/// Maximum number of Gaussians that are compared for a pair of frames.
+/// Maximum number of indices at which the Gaussians of two frames are compared; they are evenly spread over all
+/// indices.
 const MAX_COMPARED: usize = 4096;
 /// Threshold of the test whether two frames have the same order of Gaussians: the maximum median difference between
 /// Gaussians at the same index, as a fraction of the median difference between unrelated Gaussians.
 const MAX_PART_OF_UNRELATED: f64 = 0.5;
-/// Minimum number of Gaussians for the test. Frames with fewer count as being in the same order.
+/// Number of Gaussians from which on two frames are tested for the same order of Gaussians. Without a test, frames with
+/// fewer Gaussians count as being in the same order.
 const MIN_GAUSSIANS: usize = 16;
 /// Difference up to which two Gaussians count as equal (difference 0), because it may come from rounding by the program
 /// that wrote the frames. Applies to distances, as multiples of a Gaussian's size, and to differences in appearance

@@ -56,7 +56,7 @@ struct TrackPair {
     /// Count of shared frames, see [`MAX_SHARED_FRAMES`]: each frame in which both tracks are present raises it by 1,
     /// and each frame in which one of them is missing lowers it by 1, down to 0.
     shared_frames: u8,
-    /// Whether the two tracks satisfied the rule `CLOSE` in every frame in which both were present.
+    /// Whether the two tracks looked the same (rule `CLOSE`) in every frame in which both were present.
     are_close: bool,
     /// Whether the earlier track has ended, so that the later track can be joined to it.
     has_ended: bool,
@@ -142,8 +142,9 @@ impl Joiner {
         }
     }
 
-    /// Ends the joining of tracks (Gaussians followed through frames); to be called after the last frame, with the
-    /// linker of that frame. Returns a result for the rule `ALIKE` and one for the rule `CLOSE`, each a pair of
+    /// Ends the joining of tracks (Gaussians followed through frames). To be called after the last frame, with the
+    /// linker that has linked it. Returns the result of joining by the rule `ALIKE` (tracks that may be one Gaussian),
+    /// then the result by the stricter rule `CLOSE` (tracks that look the same). Each result is a pair of
     ///
     /// - a list with the number of the joined track of every track, in the order in which the tracks began;
     /// - the number of joined tracks.
@@ -156,10 +157,11 @@ impl JoinedTracks {
     /// Updates the pairs of tracks (Gaussians followed through frames) after a frame. `tracks` are the open tracks
     /// after this frame; a track that is not among them has ended. There are four cases for a pair:
     ///
-    /// - The earlier track has ended: the pair is marked.
-    /// - The later track has ended first: the two tracks are joined if they satisfied the rule `CLOSE`. The pair is
-    ///   removed.
-    /// - Both are present in this frame: the pair is removed if they do not satisfy the rule, or share too many frames.
+    /// - The earlier track has ended: the pair is marked as ready to be joined.
+    /// - The later track has ended first: the two tracks are joined if they always looked the same (rule `CLOSE`). The
+    ///   pair is removed.
+    /// - Both are present in this frame: the pair is removed if they do not satisfy the rule of `self`, or share too
+    ///   many frames.
     /// - One of them is missing in this frame: the count of shared frames is lowered.
     fn update_pairs(&mut self, tracks: &[OpenTrack]) {
         let find = |number: u32| tracks.binary_search_by_key(&number, |track| track.number).ok().map(|at| &tracks[at]);

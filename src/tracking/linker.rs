@@ -135,9 +135,10 @@ impl Linker {
     }
 
     /// Finds the open tracks (Gaussians followed through frames) whose Gaussian another Gaussian has replaced, and
-    /// returns their indices in `tracks`. `links` gives such a track no Gaussian in this frame although it had one in
-    /// the previous frame, and a similar Gaussian is at the track's expected position. `appearances` holds the
-    /// appearances of all Gaussians of the frame.
+    /// returns their indices in `tracks`. `appearances` holds the appearances of all Gaussians of the frame. Such a
+    /// track satisfies two conditions:
+    /// - It had a Gaussian in the previous frame, but `links` gives it none in this frame.
+    /// - A similar Gaussian is at its expected position.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

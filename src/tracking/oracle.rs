@@ -212,9 +212,9 @@ impl SlowLinker {
         self.extend_tracks(&all, &gaussian_of)
     }
 
-    /// Advances the open tracks (Gaussians followed through frames) by a frame, whose Gaussians are `all`. Returns the
-    /// number of the track of every Gaussian. `gaussian_of` maps each linked track to its Gaussian; all other Gaussians
-    /// begin tracks.
+    /// Adds the Gaussians of the next frame, `all`, to the tracks (Gaussians followed through frames). Returns for
+    /// every Gaussian the number of its track. `gaussian_of` maps the index of each linked track to the index of the
+    /// Gaussian that continues it. Every other Gaussian begins a new track.
     fn extend_tracks(&mut self, all: &[SeenGaussian], gaussian_of: &BTreeMap<usize, usize>) -> Vec<u32> {
         let mut numbers = vec![u32::MAX; all.len()];
         for (a, track) in self.tracks.iter_mut().enumerate() {

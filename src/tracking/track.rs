@@ -5,9 +5,9 @@ use super::grid::CellGrid;
 
 /// Maximum number of Gaussians that are considered as the continuation of a track (Gaussian followed through frames).
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Limit of the part of the distance unit that grows with the speed of a track (Gaussian followed through frames), as a
-/// multiple of the size of its Gaussian. The distance unit is the length by which distances are divided in the cost of
-/// a link.
+/// Maximum of the allowance for speed in the cost of a link, as a multiple of the size of the track's Gaussian. In this
+/// cost, the distance between the expected and the actual position is divided by a length: the size of the Gaussian
+/// plus an allowance that grows with its speed.
 const MAX_SPEED_UNITS: f32 = 3.0;
 /// Number that stands for no track (Gaussian followed through frames), or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
@@ -69,8 +69,8 @@ impl OpenTrack {
         std::array::from_fn(|c| self.appearance.position[c] + self.frames_since_seen as f32 * velocity[c])
     }
 
-    /// Returns the unit of distance in the cost of a link, scene units: the Gaussian's size, plus an amount that grows
-    /// with its speed and is at most [`MAX_SPEED_UNITS`] sizes.
+    /// Returns the length by which distances are divided in the cost of a link, scene units: the Gaussian's size, plus
+    /// an allowance that grows with its speed and is at most [`MAX_SPEED_UNITS`] sizes.
     fn distance_unit(&self) -> f32 {
         let speed = self.velocity.unwrap_or_default().iter().map(|v| v * v).sum::<f32>().sqrt();
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)

@@ -122,7 +122,7 @@ pub struct InputError {
     pub expected: String,
     /// Content that this file has at this place.
     pub found: String,
-    /// Advice to the user on the next step. May be empty.
+    /// Advice to the user on what to do about the malformed file. May be empty.
     pub hint: String,
 }
 

@@ -65,7 +65,7 @@ fn expm1_over_r(r: f64) -> f64 {
 /// Returns about −709 for 0 and subnormal numbers, and x itself for ∞ and NaN.
 #[inline(always)]
 pub fn ln(x: f64) -> f64 {
-    /// 2⁵². An f64 from 2⁵² to 2⁵³ holds the integer by which it exceeds 2⁵² in its low bits.
+    /// 2⁵². For an f64 x from 2⁵² to 2⁵³, the low bits of x hold the integer x − 2⁵².
     const INTEGERS: f64 = 4_503_599_627_370_496.0;
     const BIAS: u64 = 1023;
     // x = 2ⁿ·m with m between √½ and √2.

@@ -21,8 +21,8 @@ fn attribute_index(column: Attributes) -> usize {
 }
 
 impl Jacobian {
-    /// Maximum number of bytes per Gaussian that a Jacobian takes: full matrices for position and rotation, one factor
-    /// for each other attribute.
+    /// Maximum number of bytes per Gaussian that a [`Jacobian`] takes, in f32: 3×3 values for the position, 4×4 for the
+    /// rotation, and one factor for each of the three other attributes.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * (9 + 16 + 3);
 
     /// Returns the derivative of the single attribute `which` at the frame with respect to its stored values. The

@@ -1,4 +1,5 @@
-//! Stored parameters of Gaussians in a model format that computes the attributes at every frame from them.
+//! Stored parameters of the Gaussians of a dynamic model. The model format defines how the attributes at each frame are
+//! computed from these parameters.
 
 use serde::{Deserialize, Serialize};
 

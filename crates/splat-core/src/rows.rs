@@ -7,7 +7,7 @@ use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
 
 bitflags! {
-    /// Anomalies of a Gaussian that the pass over all frames found.
+    /// Anomalies of one Gaussian, found while its statistics over all frames were computed.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
     pub struct AnomalyFlags: u8 {
         /// A value in some frame was NaN or infinite.
@@ -194,7 +194,7 @@ pub struct StatisticRows {
     /// Fraction of (frame, view) pairs in which the opacity of the Gaussian reaches a threshold and the Gaussian
     /// touches the image.
     pub vis: Vec<f64>,
-    /// Anomalies of each Gaussian that the pass over all frames found.
+    /// Anomalies of each Gaussian, found while its statistics over all frames were computed.
     pub flags: Vec<AnomalyFlags>,
 }
 

@@ -13,17 +13,19 @@ pub struct ViewSchedule {
     /// Distinct cameras, to which the camera indices of the views refer. Some may have no view.
     pub cameras: Vec<Camera>,
     runs: Vec<ViewRun>,
-    /// Views of all runs, one run after the other, as pairs (view number, camera index).
+    /// Views of all runs (consecutive frames with equal views), one run after the other, as pairs (view number, camera
+    /// index).
     views: Vec<(u32, u32)>,
     frames: usize,
 }
 
-/// Consecutive frames that have equal views. A run ends where the next one begins.
+/// Run: consecutive frames that have equal views. A run ends at the first frame of the next run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct ViewRun {
-    /// Index of the first frame of the run.
+    /// Index in the sequence of the first frame of the run (consecutive frames with equal views).
     frame: usize,
-    /// Index of the first view of the run in the field `views` of [`ViewSchedule`].
+    /// Index of the first view of the run (consecutive frames with equal views) in the field `views` of
+    /// [`ViewSchedule`]. The views of the run end where those of the next run begin.
     view: usize,
 }
 

@@ -3,9 +3,9 @@
 //!
 //! Input: tensors of a state dict, stored positions, a time. Output: for each Gaussian the deltas of its attributes,
 //! and a mask that multiplies its stored attributes. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared
-//! Gaussian, and about 4·LANES·(features + trunk + heads) bytes of buffers per reader of frames; each name in this sum
-//! stands for the width of its layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene
-//! Rendering", 2024, and the behavior of its public renderer.
+//! Gaussian, and one [`LayerBuffers`] of about 4·LANES·(features + trunk + heads) bytes, where the three names stand
+//! for the widths of these layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering",
+//! 2024, and the behavior of its public renderer.
 
 use std::path::Path;
 
@@ -94,7 +94,7 @@ enum PreparedInput {
     Position(AttributeValues),
 }
 
-/// Reusable buffers for the outputs of the layers of a field. Each reader of frames has its own.
+/// Reusable buffers for the outputs of the layers of a field. Each thread that evaluates the field needs its own.
 #[derive(Debug, Clone, Default)]
 pub struct LayerBuffers {
     features: Vec<CacheLine>,

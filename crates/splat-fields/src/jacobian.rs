@@ -32,13 +32,14 @@ impl Field {
     /// Computes the derivative ∂state/∂raw at `time`, for the attributes `want` of a block of Gaussians. The state is
     /// the attributes at that time: the stored ones `raw` plus the delta that the field predicts.
     ///
-    /// `raw` must contain positions, and rotations if `want` contains them. `prepared` is what [`Field::prepare`]
-    /// returned for these positions. A derivative that is not finite becomes 0;
-    /// for a position, whose derivative is I + ∂delta/∂position, this concerns only ∂delta/∂position.
+    /// - `raw` must contain positions, and rotations if `want` contains them.
+    /// - `prepared` is what [`Field::prepare`] returned for these positions.
+    /// - A derivative that is not finite becomes 0. The derivative of a position is I + ∂delta/∂position; of this sum,
+    ///   only ∂delta/∂position becomes 0.
     ///
-    /// If the field has a mask, a factor on the stored attributes (option `static_mlp` or `empty_voxel`), masks and
-    /// deltas count as constant: the position at `time` then changes by the mask times the change of the stored
-    /// position.
+    /// If the field has a mask (a factor on the stored attributes, option `static_mlp` or `empty_voxel`), masks and
+    /// deltas count as constant. A change of the stored position then changes the position at `time` by the mask times
+    /// this change.
     ///
     /// # Errors
     /// Fails if `time` is not finite.

@@ -47,13 +47,14 @@ struct NetworkLayer {
     has_skip: bool,
 }
 
-/// Linear output layer (head) that computes the offset of one attribute. For screw motions there are two heads for the
-/// position: one computes the rotation part w, the other the translation part v.
+/// Linear output layer (head) that computes the offset of one attribute. A network that predicts screw motions (a
+/// rotation and a translation) has two heads for the position: one for the rotation part w, the other for the
+/// translation part v.
 #[derive(Debug, Clone)]
 struct NetworkHead {
     column: Attributes,
-    /// Index of the plane of [`PredictedMotion`] at which the outputs of the layer begin: 3 for the translation part v
-    /// of a screw motion, and 0 for everything else.
+    /// First plane (array of one component) of the attribute `column` in [`PredictedMotion`] to which the outputs of
+    /// the layer are written: 3 for the translation part v of a screw motion, 0 for every other head.
     plane: usize,
     output: Linear,
 }
@@ -62,8 +63,8 @@ struct NetworkHead {
 #[derive(Debug, Clone, Default)]
 pub struct EncodedPositions {
     rows: usize,
-    /// Encodings in groups of [`LANES`] Gaussians, [`POSITION_INPUTS`] values per Gaussian; zero after the last
-    /// Gaussian.
+    /// Encodings in groups of [`LANES`] Gaussians: [`POSITION_INPUTS`] entries per group, each with one value per
+    /// Gaussian. The values of unused lanes of the last group are 0.
     values: Vec<CacheLine>,
 }
 
@@ -92,9 +93,9 @@ struct NetworkScratch {
     /// Input of the first layer: the encodings of position and time. For a layer with a skip connection, the output of
     /// the previous layer is appended.
     input: Vec<CacheLine>,
-    /// Output of the layer that is evaluated now.
+    /// Outputs of the layer that is being evaluated.
     last: Vec<CacheLine>,
-    /// Output of the layer before the one that is evaluated now.
+    /// Outputs of the previous layer, which the layer that is being evaluated reads.
     spare: Vec<CacheLine>,
 }
 

@@ -18,12 +18,12 @@ use super::tensors::Lookup;
 const X: usize = 0;
 const Y: usize = 1;
 const Z: usize = 2;
-/// Prefix of the names of all planes in the state dict. In a name, the level and the number of the plane (0 to 5)
-/// follow.
+/// Prefix of the names of all feature planes in the state dict. In a name, the number of the level (resolution) and the
+/// number of the plane (0 to 5) follow.
 const GRIDS: &str = "deformation_net.grid.grids.";
-/// Planes without time: (number of the plane in the state dict, first axis a, second axis b).
+/// Feature planes over two axes of space, each as (number of the plane in the state dict, first axis a, second axis b).
 pub(super) const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
-/// Numbers of the planes over (x, t), (y, t) and (z, t) in the state dict.
+/// Numbers in the state dict of the feature planes over an axis of space and time: (x, t), (y, t) and (z, t).
 const TEMPORAL: [usize; 3] = [2, 4, 5];
 
 /// Plane of features over two axes a and b: a grid of texels (grid points with one value per channel). Stored as
@@ -35,7 +35,8 @@ pub(super) struct FeaturePlane {
     texels: Vec<f32>,
 }
 
-/// Six planes of features of one level (one of several resolutions).
+/// Feature planes of one level (one of several resolutions): three over two axes of space, and three over an axis of
+/// space and time.
 #[derive(Debug, Clone)]
 pub(super) struct Level {
     pub(super) channels: usize,
@@ -43,8 +44,8 @@ pub(super) struct Level {
     pub(super) temporal: [FeaturePlane; 3],
 }
 
-/// Feature planes over (x, t), (y, t) and (z, t) of one level, interpolated at a fixed time t. What remains is one line
-/// of features, `[size_a, channels]`, for each of the axes x, y, z.
+/// Feature planes over (x, t), (y, t) and (z, t) of one level (resolution), interpolated at a fixed time t. Each plane
+/// becomes a line of features, `[size_a, channels]`, along x, y or z, in this order.
 pub(super) type TimeLines = [Vec<f32>; 3];
 
 /// Box in space that the feature planes cover.
@@ -93,13 +94,15 @@ pub struct TexelPair {
     pub fraction: f32,
 }
 
-/// Time-independent part of the HexPlane features of a block of Gaussians.
+/// Part of the HexPlane features of a block of Gaussians that does not depend on time, so it is computed once and used
+/// for every frame.
 #[derive(Debug, Clone)]
 pub(super) struct PreparedPlanes {
-    /// Products of the samples of the three planes without time, `[rows, width]` with one row per Gaussian.
+    /// Product of the features that were sampled at each Gaussian from the planes over (x, y), (x, z) and (y, z):
+    /// `[rows, width]`, one row per Gaussian with the channels of all levels (resolutions).
     product: Vec<f32>,
-    /// Texels and weights for interpolation along x, y and z in the three planes with time: `[rows, levels, 3]` with
-    /// one row per Gaussian.
+    /// Position of each Gaussian along x, y and z in the planes over (x, t), (y, t) and (z, t), as two texels and a
+    /// weight: `[rows, levels, 3]`, one row per Gaussian.
     taps: Vec<TexelPair>,
 }
 
@@ -199,7 +202,7 @@ impl Planes {
         Ok(Planes { space, levels })
     }
 
-    /// Returns the number of features per Gaussian, which is the number of channels summed over all levels.
+    /// Returns the number of features per Gaussian: the number of channels summed over all levels (resolutions).
     pub(super) fn width(&self) -> usize {
         self.levels.iter().map(|level| level.channels).sum()
     }
@@ -242,7 +245,7 @@ impl Planes {
     }
 
     /// Interpolates the planes that have a time axis at the time `time`, so that each becomes a line of features along
-    /// one axis of space. Returns, for every level, three lines: along x, y and z.
+    /// one axis of space. Returns, for every level (resolution), three lines: along x, y and z.
     pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
         let line = |level: &Level, plane: &FeaturePlane| {
             let TexelPair { low, high, fraction } = texel_pair(time, plane.size_b);

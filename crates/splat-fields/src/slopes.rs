@@ -35,12 +35,13 @@ fn channel_chunk(channels: &[f32], first: usize) -> [f32; CHANNEL_CHUNK] {
 
 /// Four texels (grid points) of a feature plane around a point, with the data for bilinear interpolation between them.
 struct BilinearPatch<'a> {
-    /// Channels of the texels (low a, low b), (high a, low b), (low a, high b), (high a, high b), where a and b are the
-    /// axes of the plane.
+    /// Features of the four texels (low a, low b), (high a, low b), (low a, high b), (high a, high b), where a and b
+    /// are the axes of the plane, and each texel has one value per channel.
     corners: [&'a [f32]; 4],
-    /// Weights of the texels with the higher index along the axes a and b.
+    /// Weights of the texels with the higher index, for interpolation along the axes a and b of the plane.
     fractions: [f32; 2],
-    /// Texels per unit of normalized coordinate along the axes a and b; 0 where coordinates are clamped.
+    /// Number of texels in one unit of the normalized coordinate, along the axes a and b of the plane. 0 along an axis
+    /// on which the coordinate was clamped.
     per_unit: [f32; 2],
 }
 
@@ -77,8 +78,8 @@ impl<'a> BilinearPatch<'a> {
     }
 }
 
-/// Two neighboring texels (grid points) with the data for linear interpolation between them. They lie on a line of
-/// features along one axis of space, which is what remains of a plane over this axis and time when the time is fixed.
+/// Two neighboring texels (grid points) on a line of features along one axis of space, with the data for linear
+/// interpolation between them. The line comes from a feature plane over this axis and time, interpolated at one time.
 struct TimeLineSegment<'a> {
     ends: [&'a [f32]; 2],
     fraction: f32,

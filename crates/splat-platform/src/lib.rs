@@ -132,7 +132,7 @@ pub enum FileKind {
     CharacterDevice,
     /// Device that is read or written in blocks, such as a disk.
     BlockDevice,
-    /// Any kind of entry that is not listed above.
+    /// Entry of any kind for which [`FileKind`] has no other variant.
     Other,
 }
 
@@ -156,7 +156,7 @@ impl FileKind {
 pub struct MemoryLimit {
     /// Limit in bytes, as the system reports it: 0 and numbers from [`UNLIMITED_BYTES`] on mean no limit.
     pub bytes: u64,
-    /// Part of the system that sets the limit.
+    /// Part of the system that sets the limit, such as a control group.
     pub source: LimitSource,
 }
 
@@ -178,10 +178,10 @@ pub enum LimitSource {
 /// Every memory limit that the system reports for this process.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct MemoryLimits {
-    /// Limits that apply to more than this process: the physical memory of the machine first, then control groups or
-    /// job objects.
+    /// Memory limits that this process shares with other processes: the physical memory of the machine first, then
+    /// control groups or job objects.
     pub shared: Vec<MemoryLimit>,
-    /// Limits of this process alone.
+    /// Memory limits of this process alone, such as those of `ulimit`.
     pub process: Vec<MemoryLimit>,
 }
 
@@ -189,15 +189,15 @@ pub struct MemoryLimits {
 /// size or more.
 pub const UNLIMITED_BYTES: u64 = 1 << 62;
 
-/// Message to standard error for a file that was truncated while it was mapped to memory. The process writes it and
-/// then ends. The message consists of `before`, the path of the file, and `after`.
+/// Parts of the message that the process writes to standard error before it ends because a file was truncated while it
+/// was mapped to memory. The message is `before`, the path of the file, and `after`.
 #[derive(Debug, Clone, Copy)]
 pub struct TruncatedMapMessage {
-    /// Text before the path of the file.
+    /// First part of the message, directly before the path of the truncated file.
     pub before: &'static str,
-    /// Text that replaces the path of the file if the path is unknown.
+    /// Text that stands in the message in place of the path of the truncated file if the path is unknown.
     pub unknown_path: &'static str,
-    /// Text after the path of the file. Must end with a line break.
+    /// Last part of the message, directly after the path of the truncated file. Must end with a line break.
     pub after: &'static str,
 }
 

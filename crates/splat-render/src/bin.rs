@@ -1,8 +1,9 @@
 //! Assignment of splats (image footprints of Gaussians) to tiles, in the order from front to back.
 //!
 //! One radix sort orders all splats of a render by depth. A counting sort then lists the splats of each tile in this
-//! order. The lists consist of (splat, tile) pairs. Only the pairs of one strip of tiles are in memory at a time, so
-//! their memory is limited in every view. Memory: 16 bytes per splat, and 4 bytes per pair of the strip.
+//! order. The lists consist of (splat, tile) pairs. The tiles are processed in strips of consecutive tiles, and only
+//! the pairs of one strip are in memory at a time, so their memory is limited in every view. Memory: 16 bytes per
+//! splat, and 4 bytes per pair of the strip.
 
 use std::ops::Range;
 
@@ -12,7 +13,8 @@ use super::project::{Splats, TileRect};
 /// pairs is a strip by itself.
 pub(super) const STRIP_PAIRS: usize = 1 << 20;
 
-/// Number of splats whose tile rectangles are read together, so that their waits for memory overlap.
+/// Number of splats whose rectangles of tiles are read together, so that the processor waits for several of these reads
+/// at once.
 const PREFETCHED: usize = 64;
 
 /// Lists of the splats of each tile, nearest splat first.
@@ -23,20 +25,21 @@ pub(super) struct Bins {
     keys: Vec<u64>,
     /// Buffer that the sort reuses; its content has no meaning.
     spare: Vec<u64>,
-    /// Number of tiles per row.
+    /// Number of tiles in a row of tiles of the render.
     tiles_across: usize,
     /// Prefix sums over the tiles of the whole render, row by row: for each tile, the number of (splat, tile) pairs of
     /// this tile and of all tiles before it. The pairs of a tile begin where the pairs of the previous tile end.
     ends: Vec<usize>,
-    /// First tile that [`Bins::next_strip`] has not returned yet.
+    /// Number of the first tile that [`Bins::next_strip`] has not returned yet, counted row by row.
     next_tile: usize,
-    /// Tiles whose (splat, tile) pairs are in memory.
+    /// Current strip: the range of tiles whose (splat, tile) pairs are in memory.
     strip: Range<usize>,
-    /// Index of the splat of every (splat, tile) pair of the strip, tile after tile, and nearest splat first within a
-    /// tile.
+    /// For every (splat, tile) pair of the current strip (the tiles that are processed together), the index of its
+    /// splat: tile after tile, and nearest splat first within a tile.
     pairs: Vec<u32>,
-    /// Used while `pairs` is filled: for each tile of the strip, the index in `pairs` at which its next splat is
-    /// written. An additional last entry holds the number of all pairs.
+    /// Used while `pairs` is filled: for each tile of the current strip (the tiles that are processed together), the
+    /// index in `pairs` at which the next splat of the tile is written. An additional last entry holds the number of
+    /// all pairs.
     next_slots: Vec<u32>,
 }
 
@@ -71,8 +74,8 @@ impl Bins {
         self.next_tile = 0;
     }
 
-    /// Makes [`Bins::next_strip`] start again at the first tile. If one strip held all tiles, its pairs are in memory
-    /// already and are not computed again.
+    /// Makes [`Bins::next_strip`] start again at the first tile. If all tiles were in one strip (range of tiles
+    /// processed together), its pairs are still in memory and are not computed again.
     pub(super) fn rewind(&mut self) {
         self.next_tile = 0;
     }
@@ -160,7 +163,7 @@ impl Bins {
     }
 
     /// Returns the index of the splat of every (splat, tile) pair of `tiles`, tile after tile. The tiles must lie in
-    /// the strip, whose pairs are in memory.
+    /// the range that [`Bins::next_strip`] returned last, because only its pairs are in memory.
     pub(super) fn pairs(&self, tiles: Range<usize>) -> &[u32] {
         let before = self.start(self.strip.start);
         &self.pairs[self.start(tiles.start) - before..self.start(tiles.end) - before]
@@ -176,8 +179,8 @@ impl Bins {
         })
     }
 
-    /// Returns the indices of the splats of the tiles in row `y` and columns `x` of the tiles, tile after tile. The
-    /// tiles must lie in the strip, whose pairs are in memory.
+    /// Returns the indices of the splats of the tiles in row `y` and columns `x` of the grid of tiles, tile after tile.
+    /// The tiles must lie in the range that [`Bins::next_strip`] returned last, because only its pairs are in memory.
     pub(super) fn pairs_in_row(&self, y: usize, x: Range<usize>) -> &[u32] {
         self.pairs(y * self.tiles_across + x.start..y * self.tiles_across + x.end)
     }

@@ -34,12 +34,13 @@ pub(super) struct SampledPixels {
     xs: TileLine,
     /// Offset of each row of the tile from its first row, in pixels of the image.
     ys: TileLine,
-    /// First and last column of the left half of the tile, then of the right half, as offsets from the first column of
-    /// the tile in pixels of the image. Each half has up to eight columns of the render.
+    /// Positions of the first and the last pixel column of the left half of the tile (up to eight columns of the
+    /// render), then of the right half. A position is the offset from the first column of the tile, in pixels of the
+    /// image.
     spans: [[f32; 2]; SIDE / LANES],
-    /// Number of columns of the tile that belong to the render.
+    /// Number of pixel columns of the tile that lie in the render. Tiles at the right edge may have fewer than 16.
     across: usize,
-    /// Number of rows of the tile that belong to the render.
+    /// Number of pixel rows of the tile that lie in the render. Tiles at the bottom edge may have fewer than 16.
     down: usize,
 }
 
@@ -87,7 +88,8 @@ impl SampledPixels {
 pub(super) struct Fragment<V: Lanes> {
     /// Alpha (opacity of the splat at the pixel), at most 0.99.
     pub(super) alpha: V,
-    /// Mask of the pixels in which the splat is blended.
+    /// Mask of the pixels in which the splat is blended: alpha is at least 1/255, and the transmittance behind the
+    /// splat is at least [`MIN_TRANSMITTANCE`].
     pub(super) blended: V::Mask,
     /// Weight of the splat in the pixel, alpha · transmittance; 0 where the splat is not blended.
     pub(super) weight: V,
@@ -108,25 +110,29 @@ pub(super) trait BlendSink {
     type Accumulator<V: Lanes>: Copy;
     /// Returns the initial values that are summed up for `splat`, before any pixel is added.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Adds the values of a splat in some pixels to its accumulator, and returns the accumulator. `fragment` holds the
-    /// values in the pixels of group `group`; a group is [`LANES`] neighboring pixels in a row of the tile. If `V` has
-    /// more than [`LANES`] lanes, `fragment` also holds the values in the pixels of the following groups.
+    /// Adds the values `fragment` of a splat in some pixels to `accumulator`, the sums of this splat so far, and
+    /// returns the new sums. The pixels are those of group `group` of the tile; a group is [`LANES`] neighboring pixels
+    /// of a row. If `V` has more than [`LANES`] lanes, `fragment` also holds the values in the pixels of the following
+    /// groups.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
         group: usize,
         fragment: Fragment<V>,
     ) -> Self::Accumulator<V>;
-    /// Order in which a splat is blended in the groups of eight pixels of a tile. If true: first all groups with even
-    /// index, then all groups with odd index. If false: by increasing index. Has an effect only if a vector holds a
-    /// single group.
-    const SPLITS_EVEN_ODD: bool = false;
-    /// Swaps the two sums of an accumulator that keeps one sum for groups of pixels with even index and one for groups
-    /// with odd index. Each added group goes to the first sum, so a swap directs the following groups to the other sum.
-    /// Called twice per splat: after the groups with even index, and after the groups with odd index.
+    /// Order in which the groups of eight pixels of a tile are processed for one splat:
+    /// - true: first all groups with even index, then all groups with odd index;
+    /// - false: all groups by increasing index.
     ///
-    /// The default implementation returns the accumulator unchanged: it is for sinks that keep no such sums. A sink
-    /// that keeps them must also return it unchanged for vectors of several groups, which add to both sums at once.
+    /// Matters only for vectors of a single group.
+    const SPLITS_EVEN_ODD: bool = false;
+    /// Swaps the two sums of an accumulator that consists of one sum over the groups of pixels with even index and one
+    /// over the groups with odd index. With vectors of one group, [`BlendSink::add`] always adds to the first of the
+    /// two, so a swap directs the following groups to the other sum. Called twice per splat: after the groups with even
+    /// index, and after the groups with odd index.
+    ///
+    /// The default implementation returns the accumulator unchanged, for receivers without two sums. A receiver with
+    /// two sums must return it unchanged, too, if a vector has several groups: such a vector adds to both sums at once.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
@@ -162,10 +168,10 @@ impl BlendSink for ColorSink {
 /// Weights alpha · transmittance of one splat in one tile.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Weight {
-    /// Sum of the weights alpha · transmittance of the splat over the sampled pixels: at most 256 terms, added in f32
-    /// in a fixed order.
+    /// Sum of the weights alpha · transmittance of the splat over the rendered pixels of the tile: at most 256 terms,
+    /// added in f32 in a fixed order.
     pub(super) sum: f32,
-    /// Largest weight alpha · transmittance of the splat in any sampled pixel.
+    /// Largest weight alpha · transmittance of the splat in any rendered pixel of the tile.
     pub(super) max: f32,
 }
 
@@ -176,7 +182,7 @@ pub(super) struct WeightSink<'a> {
 }
 
 impl BlendSink for WeightSink<'_> {
-    /// Sum of the weights of the splat so far for each lane, then the largest weight so far in each lane.
+    /// Sums of the weights of a splat so far, one per lane, and the largest weight so far in each lane.
     type Accumulator<V: Lanes> = (V::Sums, V);
     #[inline(always)]
     fn begin<V: Lanes>(&self, _: &Splat) -> (V::Sums, V) {
@@ -295,7 +301,7 @@ const LOOKAHEAD: usize = 16;
 struct TileFootprint {
     /// Index of the splat in the list of splats of the tile.
     pair: usize,
-    /// Set of the groups of pixels in which the splat may be visible, one bit per group.
+    /// Bit set of the groups (eight neighboring pixels of a row) in which the splat may be visible.
     groups: u32,
     /// Position of the center of the splat along y, relative to the first row of the tile, in pixels of the image.
     v: f32,
@@ -363,7 +369,8 @@ impl TileFootprint {
     }
 }
 
-/// Value of [`TileFootprint::levels`] in a row in which a splat is not drawn: it makes alpha 0.
+/// Exponent of alpha (value of [`TileFootprint::levels`]) in a row of pixels in which a splat must not be drawn. It is
+/// so low that alpha becomes 0.
 const EXCLUDED_LEVEL: f32 = -1e9;
 
 /// Blends splats over a tile like [`BlendKernel::tile`], with vectors of type `V`.

@@ -75,7 +75,7 @@ mod tests {
         (filled, Camera::look_at(DVec3::new(0.3, -2.0, 0.4), DVec3::ZERO, 0.8, (33, 20)))
     }
 
-    /// Returns `planes` features with values in [−3, 3).
+    /// Returns `planes` features of the 40 Gaussians of `scene`, with values in [−3, 3).
     fn features(planes: usize) -> AttributeValues {
         let mut filled = AttributeValues::zeros(planes, 40);
         filled.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = 6.0 * ((k as f32 * 0.618_034).fract() - 0.5));

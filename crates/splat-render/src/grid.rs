@@ -1,4 +1,5 @@
-//! Regular grid of pixels of an image: a render of every s-th pixel costs about 1/s² of the render of all pixels.
+//! Grid that consists of every s-th pixel of an image along x and y. A render of these pixels alone costs about 1/s² of
+//! a render of all pixels.
 
 use std::num::NonZeroU32;
 
@@ -53,12 +54,14 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Returns the tiles of the grid (16×16 pixels of the grid each) in which a splat can change a pixel; there may be
-    /// none. They contain every pixel of the grid that lies in `rect` and at most `half` from `at` on each axis.
+    /// Returns the tiles of a render of this grid in which a splat can change a pixel. Each of these tiles has 16×16
+    /// pixels of the grid. The result is empty if the splat changes no pixel of the grid.
     ///
-    /// - `rect`: tiles of the full image that the splat can change.
-    /// - `at`: center of the splat, pixels.
-    /// - `half`: half the width and half the height of the splat, pixels.
+    /// The splat can change only pixels that lie in `rect` and are at most `half` from `at` along x and along y.
+    ///
+    /// - `rect`: tiles of the full image (16×16 pixels of the image each) that the splat can change.
+    /// - `at`: center of the splat in the image, pixels.
+    /// - `half`: half the width and half the height of the splat, pixels of the image.
     /// - `size`: width and height of the image, pixels.
     pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
         if self.stride == 1 {

@@ -107,8 +107,8 @@ pub(super) struct Splat {
     pub(super) shear: f32,
     /// Coefficient of dy² in the exponent of alpha, 1/pixels², where dy is the offset of a pixel row from the center.
     pub(super) falloff_y: f32,
-    /// Cutoff for the exponent (of 2) in the formula of alpha: a pixel whose exponent is below `−cutoff` is skipped,
-    /// because its alpha is below 1/255.
+    /// Cutoff for the exponent of 2 in the formula of alpha (see [`Splat`]): a pixel whose exponent is below `−cutoff`
+    /// is skipped, because its alpha is below 1/255.
     pub(super) cutoff: f32,
     /// Opacity of the Gaussian, in [0, 1].
     pub(super) opacity: f32,
@@ -226,14 +226,14 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, 
     }
 }
 
-/// Projected quantities of the Gaussians of one block, one array per quantity.
+/// Results of the projection for the Gaussians of one block, one array per quantity of [`Splat`].
 struct ProjectedSplats {
     depth: [f64; BLOCK],
     sort_depth: [f32; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
-    /// Coefficients of the exponent of alpha, one per Gaussian of the block, as in the fields of [`Splat`] with the
-    /// same names.
+    /// Coefficients of the exponent of alpha for each Gaussian of the block; see the fields of [`Splat`] with the same
+    /// names.
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
@@ -350,11 +350,11 @@ impl ProjectedSplats {
     }
 }
 
-/// Principal axes of one Gaussian, projected to the image.
+/// Position and principal axes of one Gaussian, in the world and projected to the image.
 pub(super) struct ProjectedShape {
     /// Depth from the camera, scene units.
     pub(super) depth: f64,
-    /// Position in camera coordinates as slopes: x / depth and y / depth.
+    /// Position in camera coordinates, divided by the depth: x / depth and y / depth.
     pub(super) slopes: [f64; 2],
     /// Derivatives of the image coordinates u and v with respect to the world position, pixels per scene unit: the rows
     /// of the Jacobian of the projection times the rotation of the camera.
@@ -363,8 +363,9 @@ pub(super) struct ProjectedShape {
     pub(super) axes: [[f64; 3]; 3],
     /// Scales (standard deviations along the axes), scene units.
     pub(super) scale: [f64; 3],
-    /// Axes of the Gaussian, each as long as one standard deviation, projected to the image: their extents along u,
-    /// then along v, in pixels. Equal to `to_pixels` · axes · scale.
+    /// The three axes of the Gaussian, each as long as one standard deviation, projected to the image: `spread[0][k]`
+    /// is the extent of axis k along x of the image, `spread[1][k]` along y, in pixels. Equal to `to_pixels` · axes ·
+    /// scale.
     pub(super) spread: [[f64; 3]; 2],
 }
 

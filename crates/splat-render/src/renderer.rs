@@ -17,7 +17,7 @@ use super::project::{CameraTerms, Splat, Splats, TileRect, project};
 use super::removal::{RemovalError, RemovalSink};
 use splat_core::{Camera, Gaussians};
 
-/// Number of Gaussians that one parallel task projects: enough to outweigh the overhead of a task.
+/// Number of Gaussians that one parallel task projects. The work is large compared with the overhead of a task.
 const SPAN: usize = 32 * BLOCK;
 
 /// Bytes of memory per visible Gaussian during a render: footprint, tile rectangle, and two copies of the depth sort
@@ -89,7 +89,8 @@ pub struct Renderer {
     pub(super) bins: Bins,
     weights: Vec<Weight>,
     pub(super) gradient_sums: ImageGradientSums,
-    /// Maximum number of (splat, tile) pairs in memory.
+    /// Maximum number of (splat, tile) pairs in memory at a time. A single tile with more pairs is processed all the
+    /// same.
     pub(super) strip_pairs: usize,
 }
 
@@ -259,12 +260,17 @@ impl Renderer {
     }
 }
 
-/// Computes one value of type `T` for each (splat, tile) pair of `tiles`, for example a removal error, and writes the
-/// values to `sums`. The tiles must lie in the strip, whose pairs are in memory.
+/// Computes one value of type `T`, for example a removal error, for each (splat, tile) pair of `tiles`, and writes the
+/// values to `sums`, tile after tile. The tiles must lie in the range that [`Bins::next_strip`] returned last, because
+/// only the pairs of this range are in memory.
 ///
-/// All values are set to the default of `T` first. Then `fill_tile` is called for each tile, with three arguments: the
-/// column and row of the tile, the indices of its splats, and the values of its pairs. `parallel` states whether rows
-/// of tiles are processed in parallel.
+/// All values are set to the default of `T` first. Then `fill_tile` is called for each tile, and changes the values of
+/// the tile. Its arguments are:
+/// - the column and the row of the tile,
+/// - the indices of the splats of the tile,
+/// - the values of the pairs of the tile, one per splat, in the same order.
+///
+/// If `parallel` is true, the rows of tiles are processed in parallel.
 pub(super) fn fill_pairs<T: Copy + Default + Send>(
     bins: &Bins,
     tiles: Range<usize>,

@@ -21,20 +21,21 @@ use crate::record::TileRecord;
 pub struct TileFrames {
     tile: Option<TileRecord>,
     decoder: TileDecoder,
-    /// Whether a raw tile is read in place, from the memory map.
+    /// Whether the loaded tile, if it is raw (plain f32), is read in place from the memory map.
     in_place: bool,
-    /// Part of a raw tile (plain f32) that has been counted in [`Reader::tiles_read`].
+    /// Part of the loaded raw tile (plain f32) that [`Reader::tiles_read`] counts already.
     counted: Counted,
 }
 
-/// Part of a raw tile (plain f32) that has been counted as read, so that it is not counted twice.
+/// Part of a raw tile (plain f32) that has been counted as read in [`Reader::tiles_read`], so that it is not counted
+/// twice.
 #[derive(Debug, Default, Clone, Copy, PartialEq)]
 enum Counted {
     #[default]
     Nothing,
-    /// Only the frame that was read last has been counted. Contains the number of this frame.
+    /// Of the raw tile, only the frame that was read last has been counted as read. Contains the number of this frame.
     Frame(usize),
-    /// The whole tile has been counted, because all of it was read to check its checksum.
+    /// The whole raw tile has been counted as read, because all of it was read to check its checksum.
     Tile,
 }
 

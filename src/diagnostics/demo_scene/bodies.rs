@@ -30,8 +30,9 @@ pub enum DemoBody {
     Egg,
     /// Cloth that is held at its left edge and waves at its right edge: neighboring Gaussians move differently.
     Cloth,
-    /// Cloud without motion, whose Gaussians each fade from opaque to invisible or from invisible to opaque. Of the
-    /// statistics, only the variance of the opacity and the life span differ from those of a wall.
+    /// Cloud without motion, whose Gaussians each fade from opaque to invisible or from invisible to opaque. So its
+    /// opacities vary, and each Gaussian is alive in only a part of the frames; its positions are as constant as those
+    /// of a wall.
     Fading,
     /// Flying sparks, each visible for an eighth of the sequence around its own time. The life spans of many sparks do
     /// not overlap. A spark does not move outside of its life span.

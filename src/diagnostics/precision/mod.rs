@@ -57,13 +57,15 @@ pub enum Knob {
     /// Number of mantissa bits of the histogram with which percentiles are found in one pass over the values. More bits
     /// mean more precise percentiles.
     Percentiles,
-    /// Arithmetic of the sums that the scan accumulates over frames: f32, f32 with compensation, or f64.
+    /// Arithmetic of the sums that the scan (pass over all frames for the statistics) accumulates: f32, f32 with
+    /// compensation, or f64.
     Sums,
     /// Parameters of merging: the radius, and the number of merging passes.
     Merging,
-    /// Parameters of refinement: the numbers of optimization steps and of target views.
+    /// Parameters of refinement: the number of optimization steps, and the number of target views (views of the
+    /// original that refinement fits).
     Refining,
-    /// Number of threads, and memory limit. They must not change a result.
+    /// Two settings of the machine that must not change a result: the number of threads, and the memory limit.
     Machine,
 }
 
@@ -124,11 +126,12 @@ pub struct PrecisionOptions {
     pub overwrite: Replace,
 }
 
-/// Total time of the runs of one setting, in seconds, after which the setting is not run again.
+/// Limit on the time spent on one setting, in seconds. Once all runs of a setting together take this time, it is not
+/// run again.
 const MAX_SETTING_SECONDS: f64 = 10.0;
 
-/// Largest size of a model, as Gaussians × frames, for which knobs that need complete runs of the program are varied by
-/// default.
+/// Maximum size of a model (number of Gaussians × number of frames) at which `precision` by default also varies those
+/// parameters whose effect is measured by complete runs of the program.
 const MAX_STATES_OF_WHOLE_RUNS: u64 = 10_000_000;
 
 /// Bytes of memory of the histogram for percentiles with [`MAX_MANTISSA_BITS`] mantissa bits.
@@ -145,7 +148,8 @@ struct Bench<'a> {
     /// Scene, with the training views of at most [`PrecisionOptions::max_frames`] of its frames.
     scene: &'a Scene,
     input: &'a InputOptions,
-    /// Size of the input, with all views, from which time and memory are estimated.
+    /// Properties of the input (such as its numbers of Gaussians, frames and training views) from which memory and time
+    /// are estimated. All frames count, also those that [`PrecisionOptions::max_frames`] leaves out.
     work: Workload,
     recipe: &'a Recipe,
     scanned: ScanResult,

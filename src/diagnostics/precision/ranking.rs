@@ -34,10 +34,12 @@ const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
 /// Values that are tried for the number of mantissa bits of the histogram from which percentiles are found.
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MAX_MANTISSA_BITS];
 
-/// Result of a ranking with one value of the varied parameter: `kept`, ids of the kept Gaussians; `cost` (time and
-/// memory), and errors. `step` is a positive number h that states how coarse this value is, as the mesh width of a
-/// numerical method does: for example 1/n for n views, or n for a stride of n. An error of order p is proportional to
-/// h^p.
+/// Result of ranking the Gaussians with one value of the varied parameter.
+/// - `value`: this value of the parameter
+/// - `step`: number h ≥ 0 that states how coarse the value is, as the mesh width of a numerical method does: for
+///   example 1/n for n views, or n for a stride of n. An error of order p is proportional to h^p.
+/// - `cost`: time and memory of the ranking
+/// - `kept`: ids of the Gaussians that the ranking keeps
 struct TriedRanking {
     value: f64,
     step: f64,
@@ -157,8 +159,8 @@ impl Bench<'_> {
     }
 
     /// Computes the scores of all Gaussians and selects the Gaussians to keep. The scores follow from the statistics of
-    /// the scan and from `contributions`, the contributions of the Gaussians to renders. `contributions` is `None` if
-    /// the recipe does not rank by renders; the scores then follow from the statistics alone.
+    /// the scan (pass over all frames) and from `contributions`, the contributions of the Gaussians to renders. If the
+    /// recipe does not rank by renders, `contributions` is `None` and the scores follow from the statistics alone.
     fn scored(&self, contributions: Option<VisibleContribution>) -> Result<Scored> {
         let measure = MeasureStages::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
         measure.score.run(self.scene, self.scanned.clone(), contributions, &mut Journal::default())
@@ -219,8 +221,8 @@ impl Bench<'_> {
         Ok(TriedRanking { value, step, cost, errors: BTreeMap::new(), kept })
     }
 
-    /// Measures the errors of percentiles that are found in one pass over the values, by histograms with several
-    /// numbers of mantissa bits. The reference is exact percentiles. Returns the measurements.
+    /// Measures the errors of percentiles that a histogram finds in one pass over the values, for histograms with
+    /// several numbers of mantissa bits. Compares them with exact percentiles. Returns the measurements.
     pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
         let scored = self.scored(self.contributions(self.recipe)?)?;
         let rows = scored.rows()?;
@@ -257,8 +259,9 @@ impl Bench<'_> {
         })
     }
 
-    /// Converts the rankings `tried`, the last with the finest setting, to a curve of errors. Adds errors of each
-    /// ranking that come from a comparison of its kept Gaussians with those of the finest setting.
+    /// Returns the errors of the rankings `tried` as a curve. The last ranking has the finest setting and is the
+    /// reference. Adds two kinds of errors to each ranking: how its kept Gaussians differ from those of the reference,
+    /// and how renders of its kept Gaussians differ from renders of the whole model.
     /// - `name`: name of the varied parameter
     /// - `against`: description of the finest setting, for the user
     /// - `own`: value of the parameter in the recipe

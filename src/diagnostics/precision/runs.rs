@@ -25,7 +25,7 @@ const RADII: [f64; 4] = [0.5, 1.0, 2.0, 4.0];
 const PASSES: [usize; 3] = [1, 2, 3];
 /// Numbers of optimization steps of refinement that are tried.
 const STEPS: [u32; 6] = [100, 250, 500, 1000, 1500, 3000];
-/// Numbers of target views of refinement that are tried.
+/// Numbers of target views (views of the original that refinement fits) that are tried.
 const PICTURES_REFINED_BY: [usize; 5] = [32, 65, 130, 260, 520];
 /// Memory limits that are tried, as multiples of the smallest limit with which the program can run.
 const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
@@ -75,8 +75,9 @@ impl Bench<'_> {
         })
     }
 
-    /// Measures complete runs with several numbers of optimization steps and several numbers of target views of
-    /// refinement. All runs end at the same number of Gaussians. Returns `None` if the recipe does not refine.
+    /// Measures complete runs with several numbers of optimization steps of refinement, and with several numbers of
+    /// target views (views of the original that refinement fits). All runs end at the same number of Gaussians. Returns
+    /// `None` if the recipe does not refine.
     pub(super) fn refining(&self) -> Result<Option<PrecisionKnob>> {
         let base = &self.recipe.refine;
         if base.refine.0.is_empty() || base.refine_steps == 0 {

@@ -1,5 +1,5 @@
-//! Measurement of the rounding errors of the sums that the scan accumulates over frames: in f32, in f32 with
-//! compensation, and in f64 as the program uses it.
+//! Measurement of the rounding errors of the sums that the scan (pass over all frames for the statistics) accumulates:
+//! in f32, in f32 with compensation, and in f64 as the program uses it.
 //!
 //! The frames of some Gaussians are played forward and backward again and again, for up to 100,000 frames, because
 //! rounding errors grow with the number of terms. The expected sums are computed in f64 with compensation.
@@ -219,8 +219,8 @@ fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize)
     std::array::from_fn(|statistic| found.iter().map(|values| values[statistic]).collect())
 }
 
-/// Computes the same statistics as [`sum_statistics`], with the scan of the program. `changed`: attributes that the
-/// scan must regard as changed at every frame.
+/// Computes the same statistics as [`sum_statistics`], but by the code that `compress` uses ([`BlockScan`]). `changed`:
+/// attributes that change from frame to frame; the code may take all others from the frame before.
 fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Attributes) -> Result<SummedStatistics> {
     let times: Vec<f64> = (0..frames_played).map(|k| k as f64).collect();
     let mut schedule = ViewSchedule::default();

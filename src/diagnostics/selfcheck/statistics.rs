@@ -14,10 +14,10 @@ use crate::statistics::{BlockScan, ScanPlan};
 
 const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
-/// Compares the statistics of motion and opacity (D, κ, V and the number of frames in which a Gaussian is alive) with
-/// their definitions in f64, for Gaussians whose life spans have many gaps. In f64, a sum of 40 terms has a rounding
-/// error of about 1e-15; a variance loses a few more digits. Returns the largest error, with the bound that it must not
-/// exceed.
+/// Compares statistics with their definitions in f64, for Gaussians whose life spans have many gaps: trajectory
+/// magnitude D, curvature κ, opacity variance V and the number of frames in which a Gaussian is alive. In f64, a sum of
+/// 40 terms has a rounding error of about 1e-15; a variance loses a few more digits. Returns the largest error, with
+/// the bound that it must not exceed.
 pub(super) fn motion() -> CaseResult {
     CaseResult::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = random_frames(500, 40);
@@ -37,25 +37,26 @@ pub(super) fn motion() -> CaseResult {
     })
 }
 
-/// Compares D and κ of a Gaussian far from the origin with exact values. Each step of the Gaussian is a whole number of
-/// ulps (units in the last place) of its f32 position, so the differences are exact. A sum of 2000 squares in f64 loses
-/// at most 1e-14. Returns the largest error, with the bound that it must not exceed.
+/// Compares trajectory magnitude D and curvature κ of a Gaussian far from the origin with exact values. Each step of
+/// the Gaussian is a whole number of ulps (units in the last place) of its f32 position, so the differences are exact.
+/// A sum of 2000 squares in f64 loses at most 1e-14. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn motion_far_away() -> CaseResult {
     CaseResult::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || compare_walks(&[(1e6, 0.0625)]))
 }
 
-/// Compares D and κ with exact values as [`motion_far_away`] does, but for subnormal positions and for positions whose
-/// squares overflow f32. Returns the largest error, with the bound that it must not exceed.
+/// Compares trajectory magnitude D and curvature κ with exact values, for two extreme motions of a Gaussian: one at
+/// subnormal positions, and one at positions whose squares overflow f32. Returns the largest error, with the bound that
+/// it must not exceed.
 pub(super) fn motion_of_any_size() -> CaseResult {
     CaseResult::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
         compare_walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
     })
 }
 
-/// Compares D and κ of a Gaussian at unevenly spaced frames with a formula. All times t are whole numbers, and one
-/// coordinate of the Gaussian is t². With m as the mean time step, its velocity between the times t and t' is m·(t +
-/// t'), and its turns (second differences) are 2m². Sums have 40 terms in f64. Returns the largest error, with the
-/// bound that it must not exceed.
+/// Compares trajectory magnitude D and curvature κ of a Gaussian at unevenly spaced frames with a formula. All times t
+/// are whole numbers, and one coordinate of the Gaussian is t². With m as the mean time step, its velocity between the
+/// times t and t' is m·(t + t'), and its turns (second differences) are 2m². Sums have 40 terms in f64. Returns the
+/// largest error, with the bound that it must not exceed.
 pub(super) fn uneven_frames() -> CaseResult {
     CaseResult::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
@@ -78,8 +79,8 @@ pub(super) fn uneven_frames() -> CaseResult {
     })
 }
 
-/// Compares the statistics D, κ and V of Gaussians that are alive (opacity ≥ alpha_min) in 0 to 3 frames with exact
-/// values. Returns the largest error, with the bound that it must not exceed.
+/// Compares trajectory magnitude D, curvature κ and opacity variance V of Gaussians that are alive (opacity ≥
+/// alpha_min) in 0 to 3 frames with exact values. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn short_lives() -> CaseResult {
     CaseResult::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
         let mut worst = LargestError::default();
@@ -116,8 +117,8 @@ pub(super) fn short_lives() -> CaseResult {
 
 /// Compares the variance V of nearly constant opacities with a computation in two passes in f64: first the mean, then
 /// the deviations from it. Opacities of 0.9 that differ by 1e-6 have rounding errors of 1e-16, so V has a relative
-/// error below 1e-9. Moments about 0 would leave only 2 correct digits. Returns the largest error, with the bound that
-/// it must not exceed.
+/// error below 1e-9. Computed from moments about 0 instead, V would have only 2 correct digits. Returns the largest
+/// error, with the bound that it must not exceed.
 pub(super) fn steady_opacity() -> CaseResult {
     CaseResult::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);
@@ -165,12 +166,15 @@ pub(super) fn projected_area() -> CaseResult {
 }
 
 /// Compares the contribution C (projected area times opacity, in pixels) of one needle-shaped Gaussian of opacity 0.5
-/// with a closed formula. The Gaussian has the variances a and b, in px², along its axes in the image, and these axes
-/// are rotated in the image plane. With 0.3 px² added to both variances, its projected covariance Σ has det Σ = (a +
-/// 0.3)(b + 0.3), and the area is proportional to √det Σ. The rotated entries of Σ are up to 1e10 px². Computed from
-/// them, det Σ = Σxx·Σyy − Σxy² would be a difference of nearly equal numbers, and lose up to ten of its 16 digits.
-/// Errors are relative to max(C, 1 px), as in [`projected_area`]. Returns the largest error, with the bound that it
-/// must not exceed.
+/// with a closed formula.
+/// - The Gaussian has the variances a and b, in px², along its axes in the image; these axes are rotated in the image
+///   plane. Projection adds 0.3 px² to both variances.
+/// - So the projected covariance Σ has the determinant (a + 0.3)(b + 0.3), and the area is proportional to its root.
+/// - The entries of Σ are up to 1e10 px². The expression Σxx·Σyy − Σxy² would lose up to ten of 16 digits, because it
+///   subtracts nearly equal numbers.
+/// - Errors are relative to max(C, 1 px), as in [`projected_area`].
+///
+/// Returns the largest error, with the bound that it must not exceed.
 pub(super) fn needle_on_screen() -> CaseResult {
     CaseResult::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);
@@ -300,8 +304,8 @@ fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> R
 }
 
 /// Returns the statistics of all Gaussians as [`BlockScan`], the code that is checked here, computes them. `frames`
-/// holds the Gaussians at each frame; frame t is at time `times[t]`. `schedule` holds the views of each frame. As
-/// readers of models do, tells the scan at each frame whether the opacities equal those of the frame before.
+/// holds the Gaussians at each frame; frame t is at time `times[t]`. `schedule` holds the views of each frame. Also
+/// passes to [`BlockScan`] whether the opacities of a frame equal those of the frame before, as readers of models do.
 fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);

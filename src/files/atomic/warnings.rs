@@ -10,8 +10,8 @@ pub(super) fn warn(message: String) {
     WARNINGS.lock().unwrap_or_else(PoisonError::into_inner).push(message);
 }
 
-/// Returns the warnings recorded since the last call. They concern steps around an output, such as removing an earlier
-/// output or the remains of a killed run. The outputs named in them are complete and at their final paths.
+/// Returns the warnings recorded since the last call. They report failures after which an output is nevertheless
+/// complete and at its final path, such as a failure to remove an earlier output or the files of a killed run.
 pub fn take_warnings() -> Vec<String> {
     std::mem::take(&mut WARNINGS.lock().unwrap_or_else(PoisonError::into_inner))
 }

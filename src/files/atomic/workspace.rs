@@ -28,18 +28,22 @@ use crate::error::{Error, Result};
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
 /// Ending of the names of workspaces (hidden folders in which outputs are written).
 const ENDING: &str = ".splatsieve-tmp";
-/// Name of the lock file in a workspace. A run keeps this file locked until it ends.
+/// Name of the lock file in a workspace (hidden folder in which an output is written). A run keeps this file locked
+/// until it ends.
 const LOCK: &str = "lock";
-/// Content of the lock file, which marks the folder as a workspace of this program.
+/// Content of the lock file of a workspace (hidden folder in which an output is written). It marks the folder as
+/// created by this program.
 pub(super) const LOCK_LINE: &str = "workspace of a splatsieve run\n";
-/// Name, in the workspace, of the output file or folder that is being written.
+/// Name, in a workspace (hidden folder), of the output file or folder that is being written there.
 pub(super) const CONTENT: &str = "content";
-/// Name, in the workspace, of an earlier output folder that is being replaced. Files in it that its summary does not
-/// list are moved into the new output folder.
+/// Name, in a workspace (hidden folder), of an earlier output folder that is being replaced. Files in it that its
+/// summary does not list are moved into the new output folder.
 pub(super) const REPLACED: &str = "replaced";
-/// Name, in the workspace, that a file or folder gets when it is no longer needed and is deleted with the workspace.
+/// Name, in a workspace (hidden folder), that a file or folder gets when it is no longer needed. It is deleted with the
+/// workspace.
 pub(super) const DISCARDED: &str = "discarded";
-/// Name, in the workspace, of the journal: the list of files of one result that get their final names together.
+/// Name, in a workspace (hidden folder), of the journal: the list of files of one result that get their final names
+/// together.
 pub(super) const JOURNAL: &str = "journal";
 /// Names of the entries of a workspace that must not be deleted with it: an earlier output folder, and a journal (list
 /// of files that get their final names together). The next run with the same output restores the earlier folder, or
@@ -95,7 +99,8 @@ impl Workspace {
         }
     }
 
-    /// Creates a workspace with the folder name `name` in `parent`; returns `None` if the name is taken.
+    /// Creates a workspace (hidden output folder) called `name` in the folder `parent`; returns `None` if the name is
+    /// taken.
     pub(super) fn with_name(parent: &Path, name: &OsStr) -> io::Result<Option<Workspace>> {
         let folder = parent.join(name);
         let mut live = live_workspaces();
@@ -115,7 +120,7 @@ impl Workspace {
         claimed
     }
 
-    /// Returns the path at which the output of this workspace is written.
+    /// Returns the path, inside this hidden folder, at which the output is written.
     pub(super) fn content(&self) -> PathBuf {
         self.folder.join(CONTENT)
     }
@@ -290,8 +295,8 @@ pub(super) enum Refusal {
 }
 
 impl Leftover {
-    /// Locks and returns the workspace `name` in `parent` if this program created it for this user and its run has
-    /// ended; otherwise returns the reason for refusing it.
+    /// Locks and returns the workspace (hidden output folder) `name` in the folder `parent` if this program created it
+    /// for this user and its run has ended; otherwise returns the reason for refusing it.
     pub(super) fn take(parent: &FolderHandle, name: &OsStr) -> std::result::Result<Leftover, Refusal> {
         let foreign = |_: io::Error| Refusal::Foreign;
         let folder = parent.open_folder(name).map_err(foreign)?;

@@ -230,14 +230,14 @@ impl MemoryCounter {
         Ok(())
     }
 
-    /// Subtracts `bytes` of memory that have been freed.
+    /// Subtracts `bytes` bytes, which have been freed, from the counted memory.
     pub(super) fn release(&mut self, bytes: u64) {
         self.used = self.used.saturating_sub(bytes);
     }
 }
 
-/// Returns a text for an error message: what was found at an image, if only one of this image and the first image has a
-/// time. `timed` says whether the first image has one.
+/// Returns the error text for an image that has a time although the first image has none, or the reverse. `timed` says
+/// whether the first image has a time.
 fn time_mismatch(timed: bool) -> &'static str {
     if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }

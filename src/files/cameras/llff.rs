@@ -26,7 +26,7 @@ const WIDTH: usize = 17;
 /// Default number of frames: that of the original DyNeRF scenes.
 const DEFAULT_FRAMES: usize = 300;
 
-/// Reads the cameras in `file`. Every camera sees every frame.
+/// Reads the cameras in `file`, a `poses_bounds.npy`. Every camera sees every frame.
 ///
 /// # Errors
 /// Fails if the array or a camera is malformed, or if the number of cameras times the number of frames exceeds the

@@ -19,10 +19,11 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Names of the two camera files of a data set, and the split whose images each file lists.
+/// Names of the two camera files of a Dynamic3DGaussians data set, and the split whose images each file lists.
 const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
 
-/// Keys whose values are lists of lists: one list per frame, with one value per camera.
+/// Keys of a Dynamic3DGaussians camera file whose values are lists of lists: one list per frame, with one value per
+/// camera.
 const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
 
 /// Returns whether the camera file with the keys `outline` is in the format of Dynamic3DGaussians.
@@ -53,8 +54,8 @@ pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<
     assembly.finish(None, shown_name(file))
 }
 
-/// Table of the values of one key, by frame and camera. The values of all frames are in one list; frames may have
-/// different numbers of cameras.
+/// Values of one of the [`KEYS`] in a camera file, by frame and camera. The values of all frames are in one list;
+/// frames may have different numbers of cameras.
 #[derive(Debug)]
 struct KeyedValues<T> {
     /// Values of all frames, one frame after another.
@@ -76,7 +77,7 @@ impl<T> KeyedValues<T> {
         frame.checked_sub(1).map_or(0, |before| self.ends[before])
     }
 
-    /// Returns the number of values (cameras) of `frame`.
+    /// Returns the number of values of frame number `frame`, one per camera.
     fn len(&self, frame: usize) -> usize {
         self.ends[frame] - self.start(frame)
     }
@@ -88,7 +89,7 @@ impl<T> KeyedValues<T> {
     }
 }
 
-/// Values of the four [`KEYS`] of one camera file, by frame and camera.
+/// Content of one camera file: for each of the four [`KEYS`], a table of its values by frame and camera.
 #[derive(Debug)]
 struct Tables {
     intrinsics: KeyedValues<[f64; 4]>,

@@ -45,13 +45,14 @@ use image_list::outline;
 pub use times::TimesSource;
 pub use virtual_rig::{surrounding_rig, virtual_rig};
 
-/// Largest image side in pixels. Above it, the number of pixels of one image approaches 2³².
+/// Maximum image width and height in pixels. Such an image has at most 2³⁰ pixels, so the number of pixels fits into 32
+/// bits.
 const MAX_SIDE_PX: u32 = 1 << 15;
 /// Maximum number of images in a data set.
 const MAX_IMAGES: usize = 1 << 24;
 
-/// File names that are searched for in a folder; the first existing one is used. `transforms*.json` come before
-/// `cameras.json`, because the `cameras.json` that 3DGS writes beside them has no times.
+/// Names of the camera files that are searched for in a folder, in this order; the first existing one is used.
+/// `transforms*.json` come before `cameras.json`, because the `cameras.json` that 3DGS writes beside them has no times.
 const NAMES: [&str; 9] = [
     "transforms_train.json",
     "transforms_test.json",
@@ -72,8 +73,11 @@ const COLMAP: [&str; 6] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "
 /// Options for reading cameras: values that are used where a camera file does not state them, and the memory limit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CameraOptions {
-    /// Image (width, height) in pixels, used if the camera file states no size and the size of the image file cannot be
-    /// read. For `poses_bounds.npy`, NeRFies and COLMAP it replaces their default image size.
+    /// Image (width, height) in pixels. Its use depends on the format:
+    ///
+    /// - `poses_bounds.npy`, NeRFies and COLMAP: it replaces their default image size.
+    /// - `transforms*.json`: it is used if the file states no size and the size of the image file cannot be read.
+    /// - Other formats: it is not used, because their files state the size.
     pub size: Option<(u32, u32)>,
     /// Number of frames, for formats that do not state it: `poses_bounds.npy` (default: 300) and folders `colmap_K`
     /// (default: the number of consecutive folders).

@@ -26,13 +26,13 @@ use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
-/// Keys of the camera file of an image.
+/// Keys that are read from `camera/ID.json`, the camera file of the image called ID.
 const CAMERA_KEYS: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
 /// Interval of training images in a data set that names no test images: every image whose index is a multiple of this
 /// number is a training image.
 const TRAIN_EVERY: usize = 4;
 
-/// Reads the data set whose `dataset.json` is `file`.
+/// Reads the NeRFies or HyperNeRF data set whose `dataset.json` is `file`.
 ///
 /// # Errors
 /// Fails if a file is missing or malformed, or if an image has no camera or no time.

@@ -28,7 +28,7 @@ use crate::model::{Rig, Split};
 /// Rotation from OpenGL camera axes (x right, y up, z backward) to OpenCV axes (x right, y down, z forward).
 const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
-/// Keys of an image entry.
+/// Keys that are read from the entry of an image in `transforms*.json`.
 const IMAGE_KEYS: [&str; 11] =
     ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
 

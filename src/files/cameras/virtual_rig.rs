@@ -8,13 +8,14 @@ use crate::model::{Camera, Rig, Shot, Split};
 /// Number of cameras around a moving scene. The static models in docs/benchmarks.md are scored with the same number of
 /// cameras.
 const CAMERAS: u32 = 12;
-/// Distance of the cameras from the center, as a multiple of the extent of the scene. With a field of view of 60° the
-/// image then spans 2.3 extents, so a cube-shaped scene fits into the image even when seen from a corner.
+/// Distance of the cameras around a moving scene from its center, as a multiple of the extent of the scene. With a
+/// field of view of 60° the image then spans 2.3 extents, so a cube-shaped scene fits into the image even when seen
+/// from a corner.
 const DISTANCE: f64 = 2.0;
 /// Horizontal field of view in degrees of the cameras around a moving scene.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
-/// Distance of the near plane as a multiple of the extent of the scene, so that visibility does not depend on the unit
-/// of length.
+/// Distance of the near plane from a camera around a moving scene, as a multiple of the extent of the scene. It is
+/// relative, so that visibility does not depend on the unit of length.
 const NEAR: f64 = 0.1;
 /// Image width and height in pixels, for the cameras around a moving scene.
 const SIDE_PX: u32 = 512;

@@ -12,7 +12,7 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 
 use crate::error::Result;
 
-/// Values of one tile; empty until the tile has been decoded.
+/// Place for the decoded values of one tile; empty until the tile has been decoded.
 type TileSlot = OnceLock<Box<[f32]>>;
 
 /// Number of locks for decoding, shared by all tiles. It is larger than the number of threads, so two threads rarely
@@ -23,11 +23,11 @@ const LOCKS: usize = 256;
 /// never wait.
 pub(super) struct HeldTiles {
     slots: Vec<TileSlot>,
-    /// Locks for decoding: the thread that decodes the tile of slot `s` holds lock `s % LOCKS`.
+    /// Locks for decoding. The thread that decodes the tile with the slot number `s` holds lock number `s % LOCKS`.
     locks: Vec<Mutex<()>>,
-    /// Maximum number of bytes of tile values kept.
+    /// Maximum number of bytes of tile values that are kept in memory.
     capacity: AtomicU64,
-    /// Bytes of `capacity` that are not used yet.
+    /// Number of bytes of tile values that may still be added until `capacity` is reached.
     left: AtomicU64,
     /// Whether a tile has been refused because it did not fit into the remaining memory. While this is set, every
     /// further tile is refused at once, without looking up its size in the file.
@@ -35,7 +35,7 @@ pub(super) struct HeldTiles {
 }
 
 impl HeldTiles {
-    /// Bytes of memory of one slot, without tile values.
+    /// Bytes of memory of one slot (place for the decoded values of one tile), without these values.
     pub(super) const BYTES_PER_SLOT: u64 = size_of::<TileSlot>() as u64;
 
     /// Creates storage for the decoded values of `slots` tiles. It is empty, and can hold no values until
@@ -96,7 +96,7 @@ impl HeldTiles {
         Ok(Some(slot.get_or_init(|| values)))
     }
 
-    /// Returns whether the decoded tile of `slot` is in memory.
+    /// Returns whether the decoded values of the tile with the slot number `slot` are in memory.
     pub(super) fn has(&self, slot: usize) -> bool {
         self.slots[slot].get().is_some()
     }

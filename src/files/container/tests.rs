@@ -52,7 +52,8 @@ impl EncodingSource {
         (noise(key) as f32 * 1e-9 + if moves { 0.05 * frame as f32 } else { 0.0 }).sin()
     }
 
-    /// Returns the attributes `want` of the Gaussians `ids` at `frame`, computed from the formula of this source.
+    /// Returns the attributes `want` of the Gaussians `ids` at frame `frame`, computed from the formula of this test
+    /// source.
     fn expected(&self, ids: &Ids<'_>, frame: usize, want: Attributes) -> Gaussians {
         let mut out = Gaussians::zeros(0, 1);
         for column in want.iter() {
@@ -177,7 +178,8 @@ fn all_tiles(container: &Container) -> (u64, u64) {
     found
 }
 
-/// Reads every frame in blocks of Gaussians, as a scan does, and asserts that all positions equal those of `source`.
+/// Reads every frame of each block of Gaussians, as a pass over all frames does, and asserts that all positions equal
+/// those of `source`.
 fn scan(source: &EncodingSource, container: &Container) {
     (0..COUNT.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().for_each(|block| {
         let ids = Ids::Range(block * GAUSSIAN_BLOCK..COUNT.min((block + 1) * GAUSSIAN_BLOCK));

@@ -10,8 +10,8 @@ use crate::error::{Error, Result, ShowPath};
 use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
-/// Number of bytes of decoded tiles in the memory-mapped file that a reader may have read before it releases their
-/// pages.
+/// Maximum number of bytes of the memory-mapped file that a reader leaves in memory after it decoded tiles from them.
+/// Above this number, it releases the pages of these tiles.
 const MAX_TOUCHED_BYTES: u64 = 1 << 20;
 
 /// Run of `len` Gaussians that are adjacent both in a tile and in the reader's list of Gaussians. `gaussian_block` is
@@ -26,20 +26,22 @@ struct TileRun {
 /// Values of one column (attribute) that a reader keeps in memory.
 pub(super) enum KeptColumn {
     Nothing,
-    /// All frames of one tile. The first field is the index of the frame block of the tile. This variant is used only
-    /// if the tile holds exactly the reader's Gaussians. The values are decompressed, or raw (uncompressed) in the
-    /// mapped file.
+    /// All frames of one tile. Used only if the tile holds exactly the reader's Gaussians.
+    ///
+    /// - The first field is the index of the tile's frame block (range of consecutive frames).
+    /// - The second field holds the values: decompressed, or raw (uncompressed) in the mapped file.
     Tile(u32, TileFrames),
     Values(FrameValues),
 }
 
-/// Values of the reader's Gaussians at some frames of a frame block.
+/// Values of one column (attribute) of the reader's Gaussians, at some frames of one frame block (range of consecutive
+/// frames that are stored together).
 #[derive(Default)]
 pub(super) struct FrameValues {
-    /// Frame numbers that the frame block covers.
+    /// Numbers of all frames in the frame block (range of consecutive frames that are stored together).
     block: Range<usize>,
-    /// Frames whose values are stored, increasing. Empty if the values are the same in all frames of the block and
-    /// stored once.
+    /// Numbers of the frames whose values are in `values`, increasing. Empty if the values are the same in all frames
+    /// of the block and stored once.
     frames: Vec<usize>,
     /// Values, laid out as `[frames, width, len]`: the stored frames, the components of the column, the reader's
     /// Gaussians.
@@ -57,12 +59,12 @@ impl FrameValues {
 }
 
 /// Reader of some Gaussians of a container, frame by frame. It keeps decoded values in memory, so that a tile is not
-/// decoded again for the next frame.
+/// decoded again for the next frame. A frame block is a range of consecutive frames that are stored together.
 ///
 /// Memory in bytes per Gaussian and column (attribute), where width is the number of components of the column:
 ///
-/// - 4 × width × frames kept. The frames kept are the frames of one frame block that the read plan lists, but at most
-///   the number given by [`ReadPlan::with_max_kept_frames`].
+/// - 4 × width for each frame whose values are kept. These frames lie in one frame block and in the read plan (the
+///   frames that will be read). There are at most as many as [`ReadPlan::with_max_kept_frames`] allows.
 /// - 8 × width in addition, if all frames of a frame block are kept.
 /// - For a raw (uncompressed) tile that is read whole: mapped memory of the same size if all frames of a frame block
 ///   may be kept, else 0.
@@ -80,9 +82,11 @@ pub(super) struct TileReader<'a> {
     announced_block: Option<u32>,
     /// For each column (attribute), the values that this reader keeps in memory, in the order of [`Container::places`].
     pub(super) kept: Vec<KeptColumn>,
-    /// Index of the frame block that was read last; the pages in `raw_in_use` belong to its tiles.
+    /// Index of the frame block (range of consecutive frames) that was read last. The pages in `raw_in_use` belong to
+    /// its tiles.
     entered: u32,
-    /// Mapped pages of raw (uncompressed) tiles in use, to be released when another frame block is entered.
+    /// Mapped pages of the raw (uncompressed) tiles that are in use. They are released when the reader goes on to
+    /// another frame block (range of consecutive frames).
     raw_in_use: TouchedPages,
     /// Mapped pages of tiles that have been decoded. They are released when they exceed 1 MiB ([`MAX_TOUCHED_BYTES`]).
     decoded: TouchedPages,
@@ -123,7 +127,8 @@ impl<'a> TileReader<'a> {
         }
     }
 
-    /// Returns the index of the frame block that contains `frame`.
+    /// Returns the index of the frame block (range of consecutive frames that are stored together) that contains
+    /// `frame`.
     fn frame_block(&self, frame: usize) -> u32 {
         (frame / self.source.reader.layout().frame_block as usize) as u32
     }
@@ -149,12 +154,16 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// Tries to decode the attribute with index `index`, for `frame` and later frames of its frame block, into the
-    /// memory of this reader. Returns whether the values of `frame` are now in the memory of this reader.
+    /// Tries to decode the attribute with index `index`, for `frame` and later frames of its frame block (range of
+    /// consecutive frames), into the memory of this reader. Returns whether the values of `frame` are now there.
     ///
-    /// Returns false if keeping the values here saves no work: the container itself keeps the tiles, the attribute does
-    /// not vary over time, or no other frame of the block is needed or may be kept. The caller then uses
-    /// [`TileReader::decode`], which writes the values directly to their destination.
+    /// Returns false if keeping the values in this reader saves no work:
+    ///
+    /// - The container itself keeps the tiles.
+    /// - The attribute does not vary over time.
+    /// - No other frame of the block is needed or may be kept.
+    ///
+    /// The caller then uses [`TileReader::decode`], which writes the values directly to their destination.
     fn try_keep(&mut self, index: usize, frame: usize) -> Result<bool> {
         let frame_block = self.frame_block(frame);
         if self.try_hold(index, frame_block)? {
@@ -310,11 +319,13 @@ impl<'a> TileReader<'a> {
         }
     }
 
-    /// Tells the operating system which tiles of the attributes `want` will be read after the frame block of `frame`,
-    /// so that it reads them ahead. Does so once per frame block; the first time, also for the block itself.
+    /// Tells the operating system which tiles of the attributes `want` will be read next, so that it reads them ahead.
+    /// These are the tiles of the frame block (range of consecutive frames) that will be read after the block of
+    /// `frame`. The first call also announces the tiles of the block of `frame`. Further calls for the same block do
+    /// nothing.
     ///
-    /// Does nothing if the reader may keep less than a frame block in memory: it then decodes each block several times,
-    /// and read-ahead would evict pages that it still needs.
+    /// Does nothing if the reader may keep the values of fewer frames than a frame block has. It then decodes each
+    /// block several times, and read-ahead would evict pages that it still needs.
     fn announce_next_tiles(&mut self, frame: usize, want: Attributes) {
         let (source, reader) = (self.source, &self.source.reader);
         let frame_block = self.frame_block(frame);

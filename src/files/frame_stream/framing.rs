@@ -51,7 +51,7 @@ pub(crate) struct IllegalField {
 const FOREIGN_OUTPUT: &str = "whatever the exporter prints must go to standard error, never into the stream";
 
 impl StreamHeader {
-    /// Length of the header in bytes.
+    /// Length in bytes of the header of a stream.
     pub(crate) const BYTES: usize = 32;
     /// First bytes of every stream, built like the first bytes of a container file.
     pub(crate) const MAGIC: [u8; 8] = *b"\x89GSTR\r\n\x1a";

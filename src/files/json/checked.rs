@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use crate::error::Error;
 use crate::files::text::{not_utf_8, without_mark};
 
-/// Size of the buffer in bytes. The file is read and checked in blocks of at most this size.
+/// Size in bytes of the buffer through which a JSON file is read. The file is read and checked in blocks of at most
+/// this size.
 const BUFFER: usize = 1 << 16;
-/// Maximum length in bytes of a string without its quotes.
+/// Maximum length in bytes of a string in a JSON file, without its quotes.
 const MAX_TEXT: u32 = 1 << 20;
 /// Maximum length in bytes of a number in a JSON file.
 const MAX_NUMBER: u32 = 1 << 10;
@@ -23,7 +24,7 @@ enum Token {
     Text,
     /// Backslash in a string: the next byte is escaped.
     Escape,
-    /// Number or keyword.
+    /// Number or keyword (`true`, `false` or `null`).
     Word,
 }
 
@@ -41,7 +42,7 @@ pub(super) struct CheckedReader<R> {
     /// Number of bytes of the buffer that have been read from the file. All of them have been checked, except up to 3
     /// bytes of an incomplete character at their end.
     filled: usize,
-    /// Offset in the file of the first byte of the buffer.
+    /// Offset in the file of the first byte of `buffer`.
     start: u64,
     is_begun: bool,
     is_blank: bool,
@@ -91,7 +92,8 @@ impl<R: Read> CheckedReader<R> {
         around
     }
 
-    /// Reads the next bytes of the file into the buffer, in place of the bytes already checked.
+    /// Reads the next bytes of the file into the buffer. The bytes already checked are dropped from it; an incomplete
+    /// character at the end stays.
     fn fill(&mut self) -> IoResult<()> {
         if self.refusal.is_some() {
             return Err(ErrorKind::InvalidData.into());

@@ -197,10 +197,13 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     }
 }
 
-/// Serde visitor of one element of a list of lists. If the element is a list, passes each of its elements to the
-/// callback `each` and returns an empty list, because the callback has received all of them. If it is not a list,
-/// returns the element itself, or a description of it if it is a text, an object or a number with a fraction. `at` is
-/// the position of the element in the outer list.
+/// Serde visitor of one element of a list of lists. `at` is the position of the element in the outer list. The result
+/// depends on the element:
+///
+/// - A list: passes each of its elements to the callback `each`, and returns an empty list, because the callback has
+///   received all of them.
+/// - A text, an object or a number with a fraction: returns a description of it.
+/// - Any other value: returns the value itself.
 struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: ElementPosition,

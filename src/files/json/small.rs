@@ -7,16 +7,17 @@ use serde::Deserialize;
 use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Number, Value};
 
-/// Maximum length in bytes of a string that is kept; no system has longer paths.
+/// Maximum length in bytes of a JSON string that is kept in memory; no system has longer paths.
 const MAX_TEXT: usize = 4096;
-/// Maximum length in bytes of a key that is kept.
+/// Maximum length in bytes of a key of a JSON object; of a longer key, only the beginning is kept in memory.
 const MAX_KEY: usize = 64;
-/// Maximum number of keys that are kept of an object, not counting the wanted keys (those that the reader asked for).
+/// Maximum number of keys of a JSON object that are kept in memory, not counting the wanted keys (those that the reader
+/// asked for).
 const MAX_KEYS: usize = 8;
-/// Maximum number of elements that are kept of a list, unless the caller asks for fewer.
+/// Maximum number of elements of a JSON list that are kept in memory, unless the caller asks for fewer.
 pub(crate) const MAX_ELEMENTS: usize = 16;
-/// Maximum number of values that are kept of one entry of the outermost object, including nested ones. A 4 × 4 matrix
-/// takes 21: itself, 4 rows and 16 numbers.
+/// Maximum number of values that are kept in memory for one entry of the outermost JSON object. Nested values count,
+/// too: a 4 × 4 matrix takes 21 (itself, 4 rows and 16 numbers).
 const MAX_VALUES: usize = 64;
 
 /// JSON value of limited size. Values that are too large are replaced by [`SmallValue::Large`], and a list keeps only
@@ -141,9 +142,9 @@ impl SmallValue {
 /// [`SmallValue`].
 #[derive(Debug)]
 pub(crate) struct Keep<'a> {
-    /// Keys that are always kept of an object.
+    /// Keys that the reader asked for: their values are kept in memory in every object.
     pub(crate) wanted: &'a [&'a str],
-    /// Maximum number of elements that are kept of a list.
+    /// Maximum number of elements of each list that are kept in memory; the elements after them are only counted.
     pub(crate) elements: usize,
 }
 
@@ -159,8 +160,8 @@ impl<'de> DeserializeSeed<'de> for Keep<'_> {
 /// depth, 0 for the outermost value.
 struct NestedValue<'a> {
     keep: &'a Keep<'a>,
-    /// Number of values, including nested ones, that may still be kept of the present entry of the outermost object.
-    /// Starts at 64 ([`MAX_VALUES`]) for every entry.
+    /// Number of values, including nested ones, that may still be kept in memory for the entry of the outermost object
+    /// that is being read. Starts at 64 ([`MAX_VALUES`]) for every entry.
     remaining: &'a mut usize,
     depth: usize,
 }

@@ -9,7 +9,8 @@ use super::{MAX_DEPTH, Node, NodeId, Pickle, Wrong};
 
 /// Maximum number of instructions in a pickle. One tensor takes about 35, so this is enough for 50,000 tensors.
 const MAX_INSTRUCTIONS: u32 = 1 << 21;
-/// Bytes of memory added for each heap allocation, as an upper bound of the allocator's overhead.
+/// Bytes of memory to count for each heap allocation in addition to its size: an upper bound of the allocator's
+/// overhead.
 const ALLOCATION_BYTES: usize = 32;
 /// Bytes of memory per entry of the memo (table of nodes that the pickle refers to again), including the growth of the
 /// table.
@@ -189,7 +190,7 @@ impl<'a> PickleMachine<'a> {
         Ok(None)
     }
 
-    /// Counts one instruction, which begins at byte `start`. Fails if there are too many.
+    /// Counts one instruction, which begins at byte `start`. Fails if there are more than [`MAX_INSTRUCTIONS`].
     fn count_instruction(&mut self, start: usize) -> Result<(), Wrong> {
         self.instructions += 1;
         if self.instructions > MAX_INSTRUCTIONS {

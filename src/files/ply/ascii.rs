@@ -12,11 +12,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::header::{Element, PlyHeader, Property, Scalar};
 use crate::error::{Error, Result, quoted};
 
-/// Maximum length in bytes of a line of a text PLY file, apart from its numbers. For each number in the row,
-/// [`LINE_BYTES_PER_NUMBER`] bytes more are allowed.
+/// Constant part of the maximum length of a line of a text PLY file, in bytes. The maximum grows by
+/// [`LINE_BYTES_PER_NUMBER`] with each number in the line.
 const LINE_BYTES: u64 = 1 << 20;
-/// Number of bytes by which each number of a row extends the maximum length of a line of a text PLY file. The longest
-/// usual form of an f64 has 24 characters.
+/// Number of bytes by which the maximum length of a line of a text PLY file grows with each number in the line. The
+/// longest usual form of an f64 has 24 characters.
 const LINE_BYTES_PER_NUMBER: u64 = 64;
 
 /// Unnamed scratch file that holds the rows of any number of text PLY files in binary form. Created when the first text
@@ -36,7 +36,8 @@ pub(crate) struct TextRows {
 }
 
 impl TextStore {
-    /// Returns a store that will create its scratch file in `folder`.
+    /// Returns a store for the converted rows of text PLY files. It creates its scratch file in `folder` when the first
+    /// rows are converted.
     pub(crate) fn new(folder: &Path) -> TextStore {
         TextStore { folder: folder.to_owned(), file: Mutex::new(None) }
     }

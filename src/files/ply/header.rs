@@ -8,8 +8,8 @@ use hashbrown::HashSet;
 
 use crate::error::{Error, Result, quoted};
 
-/// Maximum length of a header in bytes: enough for about 50,000 properties. Gaussian models have 60 to a few hundred
-/// properties.
+/// Maximum length of a PLY header in bytes: enough for about 50,000 properties. Gaussian models have 60 to a few
+/// hundred properties.
 const MAX_HEADER_BYTES: usize = 1 << 20;
 
 /// Encoding of the numbers after the header of a PLY file.
@@ -24,7 +24,7 @@ pub enum PlyEncoding {
 }
 
 impl PlyEncoding {
-    /// Names of all encodings, for messages.
+    /// Names of all encodings of a PLY file, for messages.
     const NAMES: &str = "ascii, binary_little_endian or binary_big_endian";
 
     /// Returns the encoding that the `format` line of a header calls `name`; `None` for other names.
@@ -99,7 +99,7 @@ impl Scalar {
 pub struct Property {
     /// Name of the property in the header.
     pub name: String,
-    /// Number type of the values.
+    /// Number type of the values of the property.
     pub scalar: Scalar,
     /// Offset in bytes of the value in a binary row.
     pub offset: usize,

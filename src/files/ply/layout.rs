@@ -15,7 +15,7 @@ use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 /// enough to give a valid f32 covariance.
 pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
 
-/// Largest SH degree that a file may have.
+/// Largest SH degree that a PLY file may have.
 const MAX_STORED_DEGREE: usize = 4;
 
 /// Source of the values of one plane (component of an attribute, such as the x of the position).
@@ -31,7 +31,7 @@ pub(crate) enum PlaneSource {
 /// position), the source of its values.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlyLayout {
-    /// SH degree that is read, 0 to 3.
+    /// SH degree of the Gaussians after reading, 0 to 3.
     pub(crate) sh_degree: usize,
     /// SH degree of the file, 0 to 4. Coefficients of degree 4 are left out.
     pub(crate) stored_degree: usize,

@@ -297,8 +297,9 @@ fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &
     Ok(())
 }
 
-/// Replaces the attributes in the bytes `row` of a row by those of the Gaussian with index `proxy` in `proxies`.
-/// `layout` locates the attributes, and `big_endian` states the byte order.
+/// Replaces the attributes of one output row by those of the proxy with index `proxy` in `proxies`. (A proxy is a
+/// Gaussian that replaces a merged cluster.) `row` holds the bytes of the row, `layout` locates the attributes in it,
+/// and `big_endian` states the byte order.
 fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
     for column in Attributes::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {

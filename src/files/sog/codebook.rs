@@ -1,9 +1,10 @@
 //! Scalar quantization for `.sog` files: a codebook is a list of 256 numbers, and a value is stored as the byte that is
 //! the index of the nearest number.
 
-/// Number of entries of a codebook.
+/// Number of entries of a codebook (list of the numbers that stored bytes stand for).
 pub const ENTRIES: usize = 256;
-/// Number of equal bins into which the range of the values is divided to find the entries.
+/// Number of bins of equal width into which [`Codebook::fit`] divides the range of the input values, to find out how
+/// dense they are.
 const BINS: usize = 1 << 14;
 
 /// Codebook: list of at most 256 numbers (entries). A stored byte is an index in this list.
@@ -78,8 +79,8 @@ impl Codebook {
     }
 }
 
-/// One of the bins of equal width into which the range of the values is divided: the number of values in the bin, the
-/// smallest and the largest of them.
+/// One of the bins of equal width into which [`Codebook::fit`] divides the range of the input values. Holds the number
+/// of values in the bin, and the smallest and the largest of them.
 #[derive(Debug, Clone, Copy)]
 struct Bin {
     count: u64,

@@ -12,18 +12,18 @@ use crate::model::{AttributeValues, logit};
 /// Largest number of 16 bits. A `.sog` file stores such a number in two images: its low byte in one, its high byte in
 /// the other.
 const MAX_16_BIT: f64 = 65_535.0;
-/// Alpha of a pixel that stores a quaternion without its component w. 253, 254 and 255 stand for quaternions without x,
-/// y and z.
+/// Alpha of a pixel that stores a quaternion without its component w. The alphas 253, 254 and 255 mean that x, y or z
+/// is left out, respectively.
 const FIRST_ROTATION_TAG: u8 = 252;
 /// Number of palette entries in one row of the image of the palette.
 const ENTRIES_PER_ROW: usize = 64;
 
-/// Number of columns and rows of the images of a file, in pixels.
+/// Size in pixels of the images in a `.sog` file that have one pixel per Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageSize {
-    /// Number of columns, a multiple of 4.
+    /// Number of pixels per row, a multiple of 4.
     pub width: usize,
-    /// Number of rows, a multiple of 4.
+    /// Number of rows of pixels, a multiple of 4.
     pub height: usize,
 }
 
@@ -71,13 +71,15 @@ impl Range3 {
         Range3 { mins, maxs }
     }
 
-    /// Returns the 16-bit number that stores `value` as component `axis`.
+    /// Returns the 16-bit number that stores `value`, the component with index `axis`, within the range of this
+    /// component.
     pub fn encode(&self, axis: usize, value: f64) -> u16 {
         let range = self.maxs[axis] - self.mins[axis];
         if range > 0.0 { (MAX_16_BIT * (value - self.mins[axis]) / range).round() as u16 } else { 0 }
     }
 
-    /// Returns the value of component `axis` that the 16-bit number `code` stands for.
+    /// Returns the value of the component with index `axis` that is stored as the 16-bit number `code`. 0 stands for
+    /// the smallest value in the range of this component, 65535 for the largest.
     pub fn decode(&self, axis: usize, code: u16) -> f64 {
         self.mins[axis] + (self.maxs[axis] - self.mins[axis]) * f64::from(code) / MAX_16_BIT
     }
@@ -225,15 +227,15 @@ pub fn encode_palette(palette: &Palette) -> (Codebook, RgbaImage) {
     (codebook, image)
 }
 
-/// Returns the pixels of the image of palette entries `image` that hold entry `label`, one per SH coefficient above
-/// degree 0; `None` if the image has no such entry.
+/// Returns the pixels that store the palette entry with index `label` in `image`, the image of a palette: one pixel per
+/// SH coefficient above degree 0. Returns `None` if the palette has no such entry.
 pub fn palette_entry(image: &RgbaImage, label: usize) -> Option<&[[u8; 4]]> {
     let coefficients = image.width / ENTRIES_PER_ROW;
     image.pixels.get(label.checked_mul(coefficients)?..)?.get(..coefficients)
 }
 
-/// Returns the image of size `size` for the palette labels of the Gaussians, with 16 bits each in red and green. Pixel
-/// i holds the Gaussian `order[i]`.
+/// Returns the image of size `size` that stores the palette label (index of the palette entry) of each Gaussian: the
+/// low byte in red, the high byte in green. Pixel i holds the Gaussian `order[i]`.
 pub fn encode_labels(labels: &[u32], size: ImageSize, order: &[u32]) -> RgbaImage {
     size.image(order, |row| {
         let [low, high, ..] = labels[row].to_le_bytes();
@@ -241,7 +243,8 @@ pub fn encode_labels(labels: &[u32], size: ImageSize, order: &[u32]) -> RgbaImag
     })
 }
 
-/// Returns the palette label that a pixel stores.
+/// Returns the palette label (index of a palette entry) that `pixel` stores: the low byte in red, the high byte in
+/// green.
 pub fn decode_label(pixel: [u8; 4]) -> usize {
     usize::from(u16::from_le_bytes([pixel[0], pixel[1]]))
 }

@@ -8,7 +8,7 @@
 
 use rayon::prelude::*;
 
-/// Maximum number of palette entries of the format.
+/// Maximum number of palette entries of a `.sog` file.
 pub const MAX_ENTRIES: usize = 1 << 16;
 /// Number of iterations of k-means.
 const ITERATIONS: usize = 6;

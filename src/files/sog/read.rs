@@ -23,7 +23,8 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// Maximum length in bytes of `meta.json`; three codebooks take about 20 kB.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Maximum number of files in an archive. `MAX_LIST_BYTES` is the maximum length in bytes of the list of these files.
+/// Maximum number of files in a `.sog` archive. `MAX_LIST_BYTES` is the maximum length in bytes of the list of these
+/// files.
 const MAX_ENTRIES: u64 = 1024;
 const MAX_LIST_BYTES: u64 = 4 << 20;
 /// Bytes of memory per pixel while an image is decoded: the image and the buffers of the decoder.
@@ -34,7 +35,7 @@ const IMAGES: u64 = 6;
 /// Maximum number of pixels of the image that holds the palette of SH coefficients: 65536 entries with 15 pixels each,
 /// one per coefficient of degrees 1 to 3.
 const MAX_PALETTE_PIXELS: usize = 15 << 16;
-/// Largest magnitude of a logarithmic coordinate that is accepted, so that the coordinate is finite as f32.
+/// Largest accepted magnitude of a logarithmic coordinate sign(x)·ln(|x| + 1). The coordinate x is then finite as f32.
 const MAX_LOG_COORDINATE: f64 = 88.0;
 /// Largest accepted magnitude of a stored SH coefficient and of the logarithm of a scale.
 const MAX_CODEBOOK_VALUE: f32 = 1e30;
@@ -203,8 +204,8 @@ fn parse(text: &[u8], path: &Path) -> Result<Meta> {
     })
 }
 
-/// Returns the ranges of the logarithmic coordinates that positions have according to `meta`. Fails if a range exceeds
-/// ±88 ([`MAX_LOG_COORDINATE`]).
+/// Returns the range of the logarithmic coordinates sign(x)·ln(|x| + 1) of positions that `meta` states, for each of
+/// the axes x, y and z. Fails if a range exceeds ±88 ([`MAX_LOG_COORDINATE`]). Messages call the archive `path`.
 fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
     let (mins, maxs) = (meta.means.mins, meta.means.maxs);
     for axis in 0..3 {

@@ -46,7 +46,7 @@ impl SogErrors {
         SogErrors { position: self.position.max(other.position), sh }
     }
 
-    /// Returns a note for the user about the errors.
+    /// Returns a note for the user that states these errors of the written file.
     pub fn error_note(&self) -> String {
         let sh = self.sh.map_or_else(String::new, |sh| format!("; RMS error of SH coefficients: {sh:.1e}"));
         format!("maximum position error: {:.2e} scene units{sh}", self.position)

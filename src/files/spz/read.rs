@@ -12,32 +12,33 @@ use crate::files::sog::images::decode_opacity;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
-/// First two bytes of a gzip file. Files of versions 2 and 3 are gzip files.
+/// First two bytes of a gzip file. `.spz` files of versions 2 and 3 are gzip files.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
-/// Number of bytes of the header of versions 2 and 3.
+/// Number of bytes of the header of an `.spz` file of version 2 or 3.
 const HEADER_BYTES: usize = 16;
-/// Maximum SH degree of the format.
+/// Maximum SH degree of an `.spz` file.
 const MAX_DEGREE: u8 = 4;
-/// Bit of the flags in the header that says that the file has extensions (optional data, which this reader skips).
+/// Bit of the flags in the header of an `.spz` file that says that the file has extensions (optional data, which this
+/// reader skips).
 const HAS_EXTENSIONS: u8 = 2;
-/// Maximum number of bytes of extensions (optional data) in a file of version 4. They lie between the header and the
-/// table of array sizes.
+/// Maximum number of bytes of extensions (optional data) in an `.spz` file of version 4. They lie between the header
+/// and the table of array sizes.
 const MAX_EXTENSION_BYTES: u64 = 1 << 20;
 /// Largest zstd window that is accepted when an array is decoded, as the base-2 logarithm of its size in bytes. The
 /// window determines the memory that the decoder takes.
 const MAX_WINDOW: u32 = 24;
 
-/// Values that the header of a file declares.
+/// Values that the header of an `.spz` file declares.
 struct Header {
     version: u32,
     count: usize,
     sh_degree: usize,
-    /// Number of fractional bits of positions.
+    /// Number n of fractional bits of positions, which are stored in units of 2⁻ⁿ scene units.
     bits: i32,
     flags: u8,
 }
 
-/// Arrays of a file. Each array holds one attribute of all Gaussians.
+/// Arrays of an `.spz` file. Each array holds one attribute of all Gaussians.
 #[derive(Default)]
 struct Arrays {
     positions: Vec<u8>,

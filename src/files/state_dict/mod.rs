@@ -97,8 +97,8 @@ pub(crate) fn is_floating(path: &Path, memory: ReadLimit) -> Result<bool> {
     Ok(StateDict::open(path, memory)?.tensors.values().all(|tensor| tensor.kind.is_float()))
 }
 
-/// Returns whether the file at `path` holds a tuple of two values instead of a state dict; false for a file that cannot
-/// be read.
+/// Returns whether the file at `path` holds a tuple of two values instead of a state dict. Grid4D saves such files,
+/// with two state dicts. Returns false for a file that cannot be read.
 pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
     Checkpoint::open(path, memory).is_ok_and(|checkpoint| {
         let pickle = checkpoint.pickle();
@@ -156,7 +156,7 @@ impl StateDict {
 /// State of the search for tensors in the object tree of a pickle.
 struct TensorSearch<'a> {
     checkpoint: &'a Checkpoint,
-    /// Number of nodes of the object tree that may still be visited.
+    /// Number of nodes of the object tree that may still be visited before the search fails.
     left: usize,
     /// Bytes of memory that the names and descriptions of the tensors found so far take, without their values.
     name_bytes: u64,

@@ -17,7 +17,7 @@ use crate::model::{StoredParams, logit, opacity};
 /// windows are replaced by windows of this width, which changes the opacity by at most 1/500 of its value. With a
 /// larger limit, the 65536 steps of the stored deviation would be too coarse for narrow windows.
 const MAX_DEVIATION: f64 = 8.0;
-/// Largest opacity, so that its logit is finite.
+/// Largest opacity that a Gaussian gets when its time window is narrowed. It is below 1, so that its logit is finite.
 const MAX_OPACITY: f64 = 1.0 - 1e-6;
 /// Maximum number of frames of a timeline of type 0, in which each Gaussian is seen in a single frame.
 pub const MAX_FRAMES: usize = 1 << 16;

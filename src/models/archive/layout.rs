@@ -88,9 +88,9 @@ pub(super) enum Values {
 }
 
 /// Field of a row of a file; each row holds the values of one Gaussian. The number in a variant is a number of bytes,
-/// or the index of a plane. A plane is one scalar component of all Gaussians. The planes of position, rotation, log
-/// scale, opacity logit and SH coefficients come first, in this order. The planes of the columns, which hold all other
-/// values of Gaussians, follow.
+/// or the index of a plane (scalar component of all Gaussians). Planes are counted in this order:
+/// - planes of position, rotation, log scale, opacity logit and SH coefficients
+/// - planes of the columns ([`ArchiveContent::columns`]), which hold all other values of Gaussians
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Field {

@@ -167,7 +167,10 @@ impl Packer {
         Ok(content)
     }
 
-    /// Adds the file at `file`, whose path relative to the model folder is `name` and whose kind of content is `holds`.
+    /// Adds a file of the model to the archive's content.
+    /// - `name`: path of the file relative to the model folder.
+    /// - `file`: path by which the file is read.
+    /// - `holds`: kind of its content, which determines the bytes that become quantized values.
     fn add_file(&mut self, name: String, file: &Path, holds: FileContent<'_>) -> Result<()> {
         let path = plain_path(&name).filter(|path| !self.layout.files.iter().any(|known| known.has_path(path)));
         let path = path.ok_or_else(|| cannot_hold(file, "the name of a file that archives do not allow"))?;

@@ -29,7 +29,8 @@ impl Arguments {
         &self.path
     }
 
-    /// Returns the key `name` with its value: the last one if the file gives several, none if it gives none.
+    /// Returns the key `name` with its value: the last value if the file has the key several times, [`Literal::None`]
+    /// if it lacks the key.
     pub(in crate::models) fn get(&self, name: &'static str) -> ConfigKey<'_> {
         let found = self.keys.iter().rev().find(|key| key.name == name);
         ConfigKey { name, value: found.map_or(&Literal::None, |key| &key.value), path: &self.path }

@@ -30,8 +30,8 @@ const STEPS: usize = 2;
 /// target state.
 const CORRECTIONS: usize = 3;
 /// Damping of a Gauss-Newton step: this fraction of the mean diagonal element of the normal matrix is added to each
-/// diagonal element. It hardly changes a step if the position moves alike in all frames, because the matrix is then
-/// well conditioned; otherwise it shortens the step.
+/// diagonal element. It hardly changes the step if the normal matrix is well conditioned, as when the position moves
+/// alike in all frames. It shortens the step of a badly conditioned matrix.
 const DAMPING: f64 = 1e-3;
 
 /// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`, one row

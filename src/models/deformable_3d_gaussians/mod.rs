@@ -133,9 +133,9 @@ impl MotionModel for DeformableMotion {
         Ok(())
     }
 
-    /// Returns the derivative of the positions at `time` with respect to the stored positions. All other derivatives
-    /// count as the identity. Derivatives of rotation and scales are not computed, because the decomposition of the
-    /// covariance into rotation and scales is not continuous from frame to frame.
+    /// Returns the derivative of the positions at `time` with respect to the stored positions. The derivatives of all
+    /// other attributes are left as the identity. Those of rotation and scales are not computed, because the
+    /// decomposition of the covariance into rotation and scales is not continuous from frame to frame.
     fn jacobian(
         &self,
         time: f64,

@@ -6,7 +6,7 @@
 
 use glam::DVec3;
 
-/// Value added to every component of w/θ and v/θ.
+/// Value that the original code adds to every component of the axis w/θ and the translation v/θ of a screw motion.
 const EPSILON: f64 = 1e-5;
 /// Minimum angle θ = |w|. Below it, the limit x + v is used, where the original code divides by zero.
 const MIN_ANGLE: f64 = 1e-30;

@@ -76,7 +76,7 @@ impl<'a> MergedSource<'a> {
     }
 
     /// Finds the proxies (Gaussians that replace merged ones) among the output Gaussians whose indices `places` lists.
-    /// Returns a pair for each proxy: its position in this list, and the index of its cluster (merged Gaussians).
+    /// Returns a pair for each proxy: its index in this list, and the index of its cluster (merged Gaussians).
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
         let clusters = &self.reduction.clusters;
         let mut by_output: Vec<(u32, usize)> =
@@ -117,8 +117,8 @@ impl FrameSource for MergedSource<'_> {
 /// values.
 struct MergedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    /// For each proxy (Gaussian that replaces merged ones) among the Gaussians that are read: its position among them,
-    /// and the index of its cluster.
+    /// For each proxy (Gaussian that replaces merged ones) among the Gaussians that are read: its row among them, and
+    /// the index of its cluster (merged Gaussians).
     proxies: Vec<(usize, usize)>,
     raw: Option<&'a Gaussians>,
 }

@@ -53,13 +53,14 @@ pub struct ModelConfig {
     pub no_do: bool,
     /// Whether the network does not deform SH coefficients (has no head for them); default true.
     pub no_dshs: bool,
-    /// Whether the network reads positions instead of features from planes.
+    /// Whether the network reads position and time (x, y, z, t) instead of features from feature planes.
     pub no_grid: bool,
     /// Whether a network computes for each Gaussian a mask: a factor on its stored parameters.
     pub static_mlp: bool,
     /// Whether a voxel grid provides for each Gaussian a mask: a factor on its stored parameters.
     pub empty_voxel: bool,
-    /// Number of frequencies whose sines and cosines are added to the features; default 0, none.
+    /// Frequency p of an encoding of the features f from the feature planes: if p is above 1, the network reads f,
+    /// sin(p·f) and cos(p·f) instead of f; default 0, no encoding.
     pub grid_pe: i64,
     /// Whether the field's rotation delta multiplies the stored quaternion instead of being added to it.
     pub apply_rotation: bool,

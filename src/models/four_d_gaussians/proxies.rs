@@ -105,11 +105,11 @@ fn merged_states(
     Ok(states)
 }
 
-/// Returns `states`, the states of proxies (Gaussians that replace merged clusters), in which every quaternion is
-/// scaled to the length that the quaternion of the proxy's leader (the most important member of the cluster) has at the
-/// same frame. The length matters because the field adds its delta to the stored quaternion, so the angle of rotation
-/// depends on the length. `of_leaders` holds the stored parameters of the leaders, `deltas` the changes that the field
-/// makes to them at this frame.
+/// Returns `states`, the states of proxies (Gaussians that replace merged clusters) at one frame, with quaternions of
+/// other lengths: each has the length of the quaternion of the proxy's leader (the most important member of the
+/// cluster) at this frame. The length matters because the field adds its delta to the stored quaternion, so the angle
+/// of rotation depends on the length. `of_leaders` holds the stored parameters of the leaders, `deltas` the changes
+/// that the field makes to them at this frame.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);

@@ -27,8 +27,8 @@ pub(in crate::models) struct FreeTime {
     /// Conversion from the times of frames to the time unit of the stored parameters, in which the clip lasts from 0 to
     /// 1.
     pub(in crate::models) clip: ClipTimes,
-    /// Lower limit to which the standard deviation in time is raised, and value that is then added to it, both in the
-    /// time unit of the stored parameters.
+    /// Two constants in the standard deviation of a temporal window, in the time unit of the stored parameters: the
+    /// lower limit to which it is raised, and the value that is then added to it.
     pub(in crate::models) deviation_floor: [f64; 2],
     /// Lower limit to which the opacity of every Gaussian is raised at every time.
     pub(in crate::models) min_opacity: f64,
@@ -37,7 +37,7 @@ pub(in crate::models) struct FreeTime {
 /// Values of some Gaussians that do not depend on time, for computing their temporal windows.
 #[derive(Debug)]
 pub(in crate::models) struct Windows {
-    /// For each Gaussian 1/(2s²), where s is the standard deviation in time.
+    /// For each Gaussian 1/(2s²), where s is the standard deviation of its temporal window.
     rates: Vec<f64>,
     /// For each Gaussian exp(−o), where o is the stored opacity logit.
     inverse_odds: Vec<f64>,

@@ -76,9 +76,9 @@ pub(in crate::models) struct Matched {
 /// Target state of one proxy (Gaussian that replaces merged ones) at one frame. It is a Gaussian with the mean and
 /// covariance of the mixture of the merged Gaussians, which is called their moment match.
 pub(in crate::models) struct ProxyAtFrame<'a> {
-    /// Index of the proxy's cluster.
+    /// Index of the cluster (merged Gaussians) that the proxy replaces.
     pub(in crate::models) proxy: usize,
-    /// Path and temporal window of the proxy.
+    /// Path and temporal window of the proxy (Gaussian that replaces merged ones).
     pub(in crate::models) line: &'a LinearPath,
     /// Time stamp of the frame.
     pub(in crate::models) time: f64,
@@ -151,14 +151,17 @@ struct FrameSums {
     product: f64,
     /// Sum over the frames of m², the square of the window.
     square: f64,
-    /// Sum over the frames of the spatial covariances, each weighted by m·α (window times opacity).
+    /// Sum over the frames of the spatial covariance of the target state, weighted by m·α (window times opacity).
     covariance: [f64; 6],
 }
 
 impl FrameSums {
-    /// Adds one frame to the sums. Row `row` of `state` is the target state of the proxy (Gaussian that replaces merged
-    /// ones) at this frame: the Gaussian with the mean and covariance of the mixture of the merged Gaussians. `m` is
-    /// the value of the proxy's temporal window, and `alpha` the opacity of the target state.
+    /// Adds one frame to the sums from which opacity and covariance of a proxy (Gaussian that replaces merged ones) are
+    /// computed.
+    /// - `m`: value of the proxy's temporal window at this frame.
+    /// - `alpha`: opacity of the proxy's target state, the Gaussian with the mean and covariance of the mixture of the
+    ///   merged Gaussians.
+    /// - `state`, `row`: the target state is row `row` of `state`.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
@@ -167,8 +170,8 @@ impl FrameSums {
         self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
-    /// Returns two averages over the added frames: the opacity logit of the proxy (Gaussian that replaces merged ones)
-    /// at the center of its temporal window, and the covariance (xx, xy, xz, yy, yz, zz). Returns `None` if no frame
+    /// Returns two averages over the added frames, for a proxy (Gaussian that replaces merged ones): its opacity logit
+    /// at the center of its temporal window, and its covariance (xx, xy, xz, yy, yz, zz). Returns `None` if no frame
     /// was added.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
         let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);

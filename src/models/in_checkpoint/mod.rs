@@ -310,9 +310,9 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 }
 
 /// Writes the compressed model `reduction` of `model` to `path` as `kind`, any kind of output except
-/// [`OutputKind::Model`]. A player format that can store the motion of the model gets this motion; any other format
-/// gets the states of the Gaussians at the frames, of which readers keep at most `held` in memory. Returns notes for
-/// the user.
+/// [`OutputKind::Model`]. Returns notes for the user. What is written depends on `kind`:
+/// - A player format that can store the motion of the model: the motion.
+/// - Any other format: the states of the Gaussians at every frame. At most `held` frames are kept in memory.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.
@@ -330,9 +330,9 @@ pub(super) fn write_frames<L: ProxyRule>(
     }
 }
 
-/// Writes the compressed model `reduction` of `model` to `path` as `kind` and returns notes for the user, if `kind` is
-/// a player format that can store the motion of the model as it is. Else writes nothing and returns `None`; the caller
-/// then writes the model from its states at the frames.
+/// Writes the motion of the compressed model `reduction` of `model` to `path`, if `kind` is a player format that can
+/// store this motion. Returns notes for the user. For any other `kind`, writes nothing and returns `None`; the caller
+/// then writes the states at the frames instead.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.

@@ -3,8 +3,12 @@
 //! - a frame stream without ids of Gaussians (format/STREAM.md, version 2),
 //! - an input that identifies Gaussians across frames, if the user asks to link it anew.
 //!
-//! Memory while frames arrive: one frame; for a container up to 128 MiB of visible Gaussians, and for each thread a
-//! tile (block of Gaussians × frames) of every column. Disk space, in a temporary folder: every frame as PLY.
+//! Memory while frames arrive:
+//! - from a stream: one frame,
+//! - from a container: up to 128 MiB of visible Gaussians, and for each thread a tile (block of Gaussians × frames) of
+//!   every column (attribute).
+//!
+//! Disk space, in a temporary folder: every frame as PLY.
 
 use std::io::Read;
 use std::ops::Range;
@@ -31,15 +35,15 @@ use crate::source::{FrameSource, Ids, ReadPlan};
 struct ReceivedFrames {
     folder: ScratchFolder,
     times: Vec<f64>,
-    /// Bytes of memory of the reader from which the frames come.
+    /// Bytes of memory that the reader of the input takes, which supplies the frames.
     reader_bytes: u64,
     /// Bytes of memory that the largest frame takes.
     largest_frame_bytes: u64,
 }
 
 impl ReceivedFrames {
-    /// Creates an empty temporary folder in `scratch`. `reader_bytes` is the memory of the reader from which the frames
-    /// come. Fails if the folder cannot be created.
+    /// Creates an empty temporary folder in `scratch` for the frames. `reader_bytes` is the memory in bytes that the
+    /// reader of the input takes. Fails if the folder cannot be created.
     fn new(scratch: &Path, reader_bytes: u64) -> Result<ReceivedFrames> {
         Ok(ReceivedFrames {
             folder: ScratchFolder::new(scratch)?,

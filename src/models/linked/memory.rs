@@ -1,5 +1,5 @@
-//! Estimates the memory of linked frames (whose Gaussians were matched across frames): while they are opened, step by
-//! step, and while they are open.
+//! Estimates the memory of linked frames, whose Gaussians were matched across frames. There are two estimates: the peak
+//! while the frames are opened, which takes several steps, and the memory while they are open.
 
 use std::mem::size_of;
 
@@ -19,7 +19,7 @@ const BYTES_PER_ROW: u64 = 16;
 /// Number of frames that are rendered before and after tracks (Gaussians followed through frames) are joined or
 /// attributes are made constant, to measure the change.
 pub(super) const SAMPLED_FRAMES: usize = 3;
-/// Bytes of memory of two renders by a virtual camera and of their comparison.
+/// Bytes of memory that two renders by a virtual camera and their comparison take.
 const RENDER_BYTES: u64 = 16 << 20;
 
 /// Counts of Gaussians and tracks (Gaussians followed through frames), from which memory is estimated.
@@ -59,7 +59,8 @@ impl Sizes {
         (TOGETHER_BYTES / self.frame_file().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
     }
 
-    /// Returns the peak bytes of memory while the frames are opened.
+    /// Returns the peak bytes of memory while frames are opened: the maximum over three steps, which are linking,
+    /// making attributes constant, and packing.
     pub(super) fn opening(&self) -> u64 {
         [self.linking(), self.holding(), self.packing()].into_iter().max().unwrap_or(0)
     }

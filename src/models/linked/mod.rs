@@ -43,7 +43,7 @@ use crate::tracking::Joiner;
 /// Opened frames whose Gaussians have been linked into tracks (Gaussians followed through frames).
 pub struct LinkedFrames {
     tracks: LinkedTracks,
-    /// Temporary container with the state of every track at every frame.
+    /// Temporary container with the state of every track (Gaussian followed through frames) at every frame.
     container: Container,
     /// Number of Gaussians, times and SH degree of the sequence. They are those of the container, except that the times
     /// may have been replaced.
@@ -51,7 +51,8 @@ pub struct LinkedFrames {
     notes: Vec<String>,
     /// Owner of the container's file; deletes the file when it is dropped.
     _scratch: ScratchFile,
-    /// Origin of the frames; `None` for PLY files of the user.
+    /// Origin of frames that were unpacked from another input, such as a container or a stream; `None` if the user gave
+    /// PLY files.
     origin: Option<Origin>,
 }
 

@@ -18,12 +18,16 @@ use crate::tracking::{Joiner, Linker};
 /// Minimum PSNR in dB of renders after a change (tracks of one Gaussian joined, attributes made constant) against
 /// renders before it.
 const MIN_PSNR_DB: f64 = 40.0;
-/// Number of virtual cameras by which each sampled frame is rendered.
+/// Number of virtual cameras from which each sampled frame is rendered, to compare renders before and after a change of
+/// the tracks.
 const VIEWS: usize = 3;
-/// Maximum deviations of an attribute from its mean along a track (Gaussian followed through frames) for which it
-/// becomes constant. Colors range from 0 to 1; `other` limits natural logs of scales, rotations in radians, and
-/// opacities. The entries are tried in this order until renders reach [`MIN_PSNR_DB`]. The first entry is about as
-/// large as the differences that trainers leave between tracks of one Gaussian; the second is half as large.
+/// Maximum deviations of an attribute from its mean along a track (Gaussian followed through frames). An attribute that
+/// deviates less becomes constant.
+/// - `color` limits colors, which range from 0 to 1.
+/// - `other` limits natural logarithms of scales, rotations in radians, and opacities.
+///
+/// The entries are tried in this order until renders reach [`MIN_PSNR_DB`]. The first entry is about as large as the
+/// differences that trainers leave between tracks of one Gaussian; the second is half as large.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
 /// Joins those of `tracks` (Gaussians followed through frames) that seem to be the same Gaussian. `joiner` proposes two

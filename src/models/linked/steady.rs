@@ -31,9 +31,10 @@ pub(super) const BATCH: usize = 1 << 16;
 /// that becomes constant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bound {
-    /// Maximum deviation of colors, whose values range from 0 to 1.
+    /// Maximum deviation of colors from their mean along the track, as a difference between color values from 0 to 1.
     pub(super) color: f64,
-    /// Maximum deviation of natural logarithms of scales, of rotations in radians, and of opacities.
+    /// Maximum deviation from the mean along the track of the natural logarithms of scales, of rotations in radians,
+    /// and of opacities.
     pub(super) other: f64,
 }
 
@@ -41,7 +42,8 @@ pub(super) struct Bound {
 pub(super) struct Steady {
     /// Attributes that are constant along each track (Gaussian followed through frames), by index of the track.
     columns: Vec<Attributes>,
-    /// Means of the attributes [`STEADY_COLUMNS`] over all frames, track by track, component by component.
+    /// Means of the attributes [`STEADY_COLUMNS`] over all frames, for every track (Gaussian followed through frames)
+    /// in order, component by component.
     means: Spill,
     sh_degree: usize,
 }
@@ -141,17 +143,20 @@ pub(super) struct TrackSums {
     /// For each track (Gaussian followed through frames) its number of frames, the sum over these frames of the opacity
     /// α, and the sum of α².
     opacity: Vec<[f64; 3]>,
-    /// For each track the sum over frames of α·v, where α is the opacity, for each component v of the attributes
-    /// [`STEADY_COLUMNS`].
+    /// For each track (Gaussian followed through frames) and each component v of the attributes [`STEADY_COLUMNS`]: sum
+    /// over frames of α·v, where α is the opacity.
     values: Vec<f64>,
-    /// For each track the sum over frames of α·q/|q|, where α is the opacity and q the quaternion.
+    /// For each track (Gaussian followed through frames): sum over frames of α·q/|q|, where α is the opacity and q the
+    /// quaternion.
     rotations: Vec<[f64; 4]>,
-    /// For each track the sum over frames of α·v² for the three log scales v, where α is the opacity.
+    /// For each track (Gaussian followed through frames): sum over frames of α·v² for the three log scales v, where α
+    /// is the opacity.
     scales: Vec<[f64; 3]>,
-    /// For each track and color channel the sum over frames of α·Σₖ vₖ², where α is the opacity and vₖ are the SH
-    /// coefficients.
+    /// For each track (Gaussian followed through frames) and color channel: sum over frames of α·Σₖ vₖ², where α is the
+    /// opacity and vₖ are the SH coefficients.
     colors: Vec<[f64; 3]>,
-    /// First quaternion of each track. A later quaternion q is replaced by −q if that is nearer to the first one.
+    /// First quaternion of each track (Gaussian followed through frames). A later quaternion q is replaced by −q if
+    /// that is nearer to the first one.
     first: Vec<[f32; 4]>,
 }
 

@@ -46,23 +46,28 @@ pub(super) struct LinkedTracks {
     /// Number of tracks (Gaussians followed through frames) that may continue in the next frame: the maximum over all
     /// frames, before tracks are joined.
     live_tracks: usize,
-    /// For each linked track the index of the joined track to which it belongs; `None` if no tracks are joined.
+    /// For each track that linking found: index of the joined track to which it belongs. Tracks that seem to be the
+    /// same Gaussian are joined to one. `None` if no tracks are joined.
     joined: Option<Vec<u32>>,
-    /// Attributes that are constant along tracks, with their values; `None` if there are none.
+    /// Attributes that are constant along tracks (Gaussians followed through frames), with their values; `None` if
+    /// there are none.
     steady: Option<Steady>,
-    /// First frame and row of each linked track.
+    /// For each track that linking found (before joining): its first frame, and the row of its Gaussian in the file of
+    /// this frame.
     births: Vec<TrackPosition>,
-    /// Index of the linked track of every Gaussian, frame by frame.
+    /// For every Gaussian, frame by frame: index of the track (Gaussian followed through frames) to which linking
+    /// assigned it, before tracks are joined.
     track_of_rows: Spill,
-    /// Index in `track_of_rows` where each frame begins, followed by the total number of entries.
+    /// Index in `track_of_rows` of the first entry of each frame, followed by the total number of entries.
     starts: Vec<u64>,
 }
 
 /// Number of frames in which each track (Gaussian followed through frames) is present, and frames that need blending.
 pub(super) struct TrackLengths {
-    /// Number of frames in which each track is present, by index of the track.
+    /// Number of frames in which each track (Gaussian followed through frames) is present, by index of the track.
     frames_per_track: Vec<u32>,
-    /// Numbers of the frames in which at least one joined track has several Gaussians, which are blended into one.
+    /// Indices of the frames in which a joined track has several Gaussians, which are blended into one. A joined track
+    /// consists of tracks (Gaussians followed through frames) that seem to be the same Gaussian.
     pub(super) blended: Vec<u32>,
 }
 
@@ -77,9 +82,9 @@ impl TrackLengths {
 
 /// Counts from linking Gaussians into tracks (Gaussians followed through frames), for notes to the user.
 pub(super) struct LinkingResult {
-    /// Number of Gaussians in all frames together.
+    /// Number of Gaussians in all frames together, before linking.
     states: u64,
-    /// Numbers of the frames that begin a new scene: no track continues into them.
+    /// Indices of the frames that begin a new scene: no track (Gaussian followed through frames) continues into them.
     cuts: Vec<usize>,
     /// Number of links between Gaussians of different frames that were ambiguous and therefore not made.
     doubtful: usize,
@@ -325,9 +330,9 @@ impl LinkedTracks {
     }
 
     /// Writes the states of all tracks (Gaussians followed through frames) at all frames to the container `path`.
-    /// Tracks are in the order of their first frames, so the tracks of a block of Gaussians are often absent together.
-    /// If they are absent from several successive blocks of frames, the block of Gaussians is encoded only for the
-    /// first of these.
+    /// Tracks are in the order of their first frames, so tracks with neighboring indices are often absent from the same
+    /// frames. If all tracks of a block are absent from several successive blocks of frames, they are encoded only for
+    /// the first of these.
     pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
@@ -373,14 +378,16 @@ impl LinkedTracks {
 struct FrameBlock<'a> {
     info: SequenceInfo,
     tracks: &'a LinkedTracks,
-    /// Number of the first frame of the block.
+    /// Index of the first frame of this block of consecutive frames.
     start: usize,
     files: &'a [Ply],
-    /// For each frame of the block the rows of its Gaussians, sorted by track.
+    /// For each frame of the block: row in the frame's file and track of every Gaussian, sorted by track (Gaussian
+    /// followed through frames).
     rows: &'a [Vec<TrackedRow>],
-    /// For each track the frame and row of the Gaussian that gives its state just before this frame block: the last
-    /// Gaussian of the track before the block. If there is none, because the track begins in the block or after it: the
-    /// first Gaussian of the track.
+    /// For each track (Gaussian followed through frames): frame and row of the Gaussian that gives its state just
+    /// before this frame block. There are two cases:
+    /// - The track has a Gaussian before the block: the last such Gaussian.
+    /// - The track begins in the block or after it: the first Gaussian of the track.
     held: &'a [TrackPosition],
 }
 
@@ -431,9 +438,10 @@ impl FrameBlock<'_> {
 struct TrackReader<'a> {
     block: &'a FrameBlock<'a>,
     range: Range<usize>,
-    /// Index, within the block, of the next frame that is to be copied to `state`.
+    /// Index, within its block of consecutive frames, of the next frame that the reader copies to `state`.
     next: usize,
-    /// Values of the attributes that were made constant along the tracks of `range`; `None` if there are none.
+    /// Values of the attributes that are constant along the tracks (Gaussians followed through frames) of `range`;
+    /// `None` if there are none.
     means: Option<HeldMeans>,
     state: Gaussians,
     part: Gaussians,

@@ -16,7 +16,7 @@ use crate::models::trajectories::merged;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 
-/// Row number of a track (Gaussian followed through frames) that is absent from a frame.
+/// Value that stands in place of a row number if a track (Gaussian followed through frames) is absent from a frame.
 const NO_ROW: u32 = u32::MAX;
 
 impl LinkedFrames {

@@ -40,20 +40,23 @@ const MIN_MARGINAL: f64 = 0.05;
 pub(super) struct Native {
     /// Whether Gaussians have a 4D rotation; if not, space and time are independent.
     pub(super) has_4d_rotation: bool,
-    /// Whether the order of rows and columns of the 4D rotation matrix is reversed, as since 15 September 2024.
+    /// Whether the rows and columns of the 4D rotation matrix are in reversed order, as in checkpoints since 15
+    /// September 2024.
     pub(super) flipped: bool,
     /// Variance that is added to the temporal variance Σ_tt of a Gaussian when its temporal marginal (factor of the
     /// opacity) is computed.
     pub(super) prefilter: f64,
     /// Number of time-dependent SH terms in use, from 0 to 2.
     pub(super) terms: usize,
-    /// Period L of colors as given by the user or the training configuration, in the model's time unit.
+    /// Period L after which time-dependent colors repeat, in the model's time unit, as given by the user or the
+    /// training configuration; `None` if neither gives it.
     pub(super) given_period: Option<f64>,
-    /// Period L of colors in use, in the model's time unit.
+    /// Period L with which time-dependent colors are computed, in the model's time unit: the given or a guessed one.
     pub(super) period: f64,
 }
 
-/// Values of a block of Gaussians that do not depend on time. They are computed once and used for every frame.
+/// Time-independent values of a block of consecutive Gaussians, from which its states at a time follow. They are
+/// computed once and used for every frame.
 #[derive(Debug)]
 pub(super) struct Slices {
     /// Velocity of each Gaussian, axis by axis, in scene units per unit of time.

@@ -31,9 +31,9 @@ use crate::recipe::MergeParams;
 use configuration::TrainingConfig;
 use frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 
-/// Number of values in the capture tuple of a 4D model.
+/// Number of values in the capture tuple (training state in a checkpoint) of a 4D model.
 const CAPTURE_LENGTH_4D: usize = 19;
-/// Number of values in the capture tuple of a static model.
+/// Number of values in the capture tuple (training state in a checkpoint) of a static model.
 const CAPTURE_LENGTH_STATIC: usize = 12;
 
 /// Model format of 4D Gaussian Splatting in its native form: recognizes and opens a training checkpoint, or the model
@@ -72,8 +72,8 @@ fn checkpoints(folder: &Path) -> Vec<PathBuf> {
     best.is_file().then_some(best).into_iter().chain(by_number).collect()
 }
 
-/// Returns whether the checkpoint at `path` is a pair of a capture tuple, whose number of values is one of `lengths`,
-/// and an iteration number.
+/// Returns whether the checkpoint at `path` is a pair: a capture tuple (the saved training state) and an iteration
+/// number. The number of values in the tuple must be one of `lengths`.
 fn has_capture(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();

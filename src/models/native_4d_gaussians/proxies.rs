@@ -92,11 +92,11 @@ pub(super) fn propose(
 /// Least-squares fit of many values by the same three functions of time: the constant 1 and two waves.
 #[derive(Debug, Clone, Default)]
 struct ThreeFunctionFit {
-    /// Matrix of the normal equations: for each pair of the three functions of time the weighted sum of their products
-    /// over the samples.
+    /// Matrix of the normal equations: for each pair of basis functions of time (the constant 1 and two cosine waves),
+    /// the weighted sum of their products over the samples.
     normal: [[f64; 3]; 3],
-    /// For each fitted value, and each of the three functions of time, the weighted sum over the samples of value ·
-    /// function.
+    /// Right-hand sides of the normal equations: for each fitted value and each of the three basis functions of time,
+    /// the weighted sum of their products over the samples.
     by_value: Vec<[f64; 3]>,
 }
 

@@ -40,7 +40,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| DeformFolder::open(path, options, &ENTRY, NodeMotion::new),
 };
 
-/// Maximum bytes of cached network outputs; each output is for all nodes at one time.
+/// Maximum bytes of cached network outputs; each output is for all control nodes at one time.
 const MAX_CACHE_BYTES: usize = 16 << 20;
 /// Maximum absolute value of a log scale; Gaussians beyond it are too small or too large to be drawn.
 const MAX_LOG_SCALE: f64 = 600.0;
@@ -59,20 +59,21 @@ struct NodeMotion {
 #[derive(Debug)]
 struct CachedNodes {
     nodes: Nodes,
-    /// Canonical positions of the nodes, encoded as input of the network.
+    /// Canonical positions of the control nodes, encoded as input of the network.
     encoded: EncodedPositions,
     /// Whether the last feature of a Gaussian is its motion mask (logit of a factor on its motion).
     has_mask: bool,
-    /// Network outputs for all nodes at the last requested times, oldest first. The key is the f32 bits of the time.
+    /// Network outputs for all control nodes at the last requested times, oldest first. The key is the f32 bits of the
+    /// time.
     cache: Mutex<VecDeque<(u32, Arc<PredictedMotion>)>>,
 }
 
-/// Values of a block of Gaussians that do not depend on time.
+/// Time-independent values of a block of consecutive Gaussians, computed once and used for every frame.
 enum PreparedNodes {
-    /// For each Gaussian the K nodes that move it: index of the node, and its weight multiplied by the motion mask
-    /// (factor from 0 to 1 on the motion of the Gaussian).
+    /// For each Gaussian the K control nodes that move it: index of the node, and its weight multiplied by the motion
+    /// mask (factor from 0 to 1 on the motion of the Gaussian).
     Shares(Vec<(u32, f64)>),
-    /// Positions encoded as input of the network, for a model without nodes.
+    /// Positions encoded as input of the network, for a model without control nodes.
     Encoded(EncodedPositions),
 }
 
@@ -173,8 +174,8 @@ impl CachedNodes {
         if self.has_mask { opacity(raw.format_specific.plane(self.nodes.features())[row]) } else { 1.0 }
     }
 
-    /// Returns the network's output for all nodes at `time`. The output is the same for all blocks of Gaussians, so it
-    /// is cached. Two threads that compute the same time get equal values.
+    /// Returns the network's output for all control nodes at `time`. The output is the same for all blocks of
+    /// Gaussians, so it is cached. Two threads that compute the same time get equal values.
     fn motion(&self, network: &Network, time: f64) -> Result<Arc<PredictedMotion>> {
         let key = (time as f32).to_bits();
         let cache = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
@@ -194,14 +195,14 @@ impl CachedNodes {
         Ok(motion)
     }
 
-    /// Returns the maximum number of times for which network outputs are cached.
+    /// Returns the maximum number of points in time for which network outputs are cached.
     fn max_cached(&self) -> usize {
         (MAX_CACHE_BYTES / (4 * 14 * self.nodes.len())).max(2)
     }
 }
 
-/// Returns for each Gaussian the weighted sum of the network's outputs for the nodes that move it. `output` has one row
-/// per node. `shares` holds (node index, weight) pairs, Gaussian by Gaussian; each Gaussian has `each` pairs.
+/// Returns for each Gaussian the weighted sum of the network's outputs for the control nodes that move it. `output` has
+/// one row per node. `shares` holds (node index, weight) pairs, Gaussian by Gaussian; each Gaussian has `each` pairs.
 fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> AttributeValues {
     let mut out = AttributeValues::zeros(output.width(), shares.len() / each.max(1));
     for c in 0..output.width() {

@@ -11,36 +11,37 @@ use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, StoredParams, opacity};
 
-/// Value added to the kernel (unnormalized weight) of every node before normalization.
+/// Value added to the kernel (unnormalized weight) of every control node before the weights are normalized.
 const FLOOR: f64 = 1e-7;
 
-/// Control nodes of a model: M nodes with h features each.
+/// Control nodes of a model: M nodes with h features each. Features are learned values by which, with the position, the
+/// nodes nearest to a Gaussian are found.
 #[derive(Debug)]
 pub(super) struct Nodes {
-    /// Position and features of each node, `[M, 3 + h]`.
+    /// Position and features (learned values) of each control node, shape `[M, 3 + h]`.
     values: Vec<f32>,
-    /// Number of values per node, 3 + h: position and h features.
+    /// Number of values per control node, 3 + h: its position and h features (learned values).
     width: usize,
-    /// For each node 1/(2r²) with its radius r, and σ(weight) with the logistic function σ.
+    /// For each control node: 1/(2r²) with its radius r, and σ(weight) with the logistic function σ.
     kernels: Vec<[f64; 2]>,
-    /// Number K of nodes that move each Gaussian.
+    /// Number K of control nodes that move each Gaussian.
     nearest: usize,
 }
 
-/// Node that moves a given Gaussian, and its weight.
+/// Control node that moves a given Gaussian, and its weight.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
-    /// Index of the node.
+    /// Index of the control node.
     pub(super) node: u32,
-    /// Weight of the node, between 0 and 1; the weights of all nodes of a Gaussian sum to 1.
+    /// Weight of the control node, between 0 and 1; the weights of all nodes of a Gaussian sum to 1.
     pub(super) weight: f64,
-    /// Weight of the node before 1e-7 is added and before normalization.
+    /// Weight of the control node before 1e-7 is added and before normalization.
     kernel: f64,
 }
 
 impl Nodes {
-    /// Reads the nodes from `tensors`, which come from `file`. `nearest` is the number K of nodes that move each
-    /// Gaussian.
+    /// Reads the control nodes from `tensors`, which come from `file`. `nearest` is the number K of nodes that move
+    /// each Gaussian.
     ///
     /// # Errors
     /// Fails if tensors are missing, have other shapes or are not finite.
@@ -73,28 +74,29 @@ impl Nodes {
         Ok(Nodes { values: nodes.data.clone(), width, kernels, nearest: nearest.clamp(1, count) })
     }
 
-    /// Returns the number h of features per node.
+    /// Returns the number h of features (learned values) per control node.
     pub(super) fn features(&self) -> usize {
         self.width - 3
     }
 
-    /// Returns the number M of nodes.
+    /// Returns the number M of control nodes.
     pub(super) fn len(&self) -> usize {
         self.kernels.len()
     }
 
-    /// Returns the number K of nodes that move each Gaussian.
+    /// Returns the number K of control nodes that move each Gaussian.
     pub(super) fn nearest(&self) -> usize {
         self.nearest
     }
 
-    /// Returns the canonical positions of the nodes, `[M, 3]`.
+    /// Returns the canonical positions of the control nodes, `[M, 3]`.
     pub(super) fn position(&self) -> AttributeValues {
         let planes = (0..3).flat_map(|c| self.values.iter().skip(c).step_by(self.width).copied());
         AttributeValues::from_planes(3, planes.collect())
     }
 
-    /// Appends to `out` the K nodes that move the Gaussian in row `row` of `raw`, nearest first, with their weights.
+    /// Appends to `out` the K control nodes that move the Gaussian in row `row` of `raw`, nearest first, with their
+    /// weights.
     pub(super) fn shares(&self, raw: &StoredParams, row: usize, out: &mut Vec<Share>) {
         let mut at: Vec<f32> = raw.gaussians.position.row::<3>(row).to_vec();
         at.extend((0..self.features()).map(|k| raw.format_specific.plane(k)[row]));

@@ -23,13 +23,13 @@ use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
 /// Maximum ratio between the widths of the temporal windows of a proxy (Gaussian that replaces merged ones) and of a
-/// member (merged Gaussian). With a larger ratio, or with centers further apart than half of the proxy's width, the
-/// windows count as different.
+/// member (merged Gaussian). With a larger ratio, or with centers further apart than half of the width of the proxy's
+/// window, the windows count as different.
 const MAX_WIDTH_RATIO: f64 = 1.5;
 /// Minimum value of a temporal window, whose maximum is 1. Times at which its value is smaller are ignored.
 const MIN_WINDOW: f64 = 0.05;
-/// Maximum number of times at which shape and opacity of a proxy (Gaussian that replaces merged ones) are compared with
-/// those of the merged Gaussians.
+/// Maximum number of points in time at which shape and opacity of a proxy (Gaussian that replaces merged ones) are
+/// compared with those of the merged Gaussians.
 const SAMPLED_TIMES: usize = 12;
 /// Minimum difference of the opacity of a proxy (Gaussian that replaces merged ones) from 0 and from 1.
 const OPACITY_MARGIN: f64 = 1e-6;

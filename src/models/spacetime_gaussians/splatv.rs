@@ -60,7 +60,7 @@ pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
 #[derive(Debug)]
 struct SplatvModel {
     file: Splatv,
-    /// Row in the file of each Gaussian of the model; `None` if no Gaussian was left out.
+    /// For each Gaussian of the model the row of the file that holds it; `None` if no Gaussian was left out.
     rows: Option<Vec<u32>>,
     /// Gaussians of the file that were repaired or left out.
     defects: Defects,
@@ -90,8 +90,8 @@ impl SplatvModel {
     }
 }
 
-/// Returns the row in the file of Gaussian `i`. `rows` holds the row of each Gaussian, or `None` if no Gaussian was
-/// left out.
+/// Returns the row of the file that holds Gaussian `i` of the model. `rows` lists this row for every Gaussian of the
+/// model; it is `None` if no Gaussian of the file was left out, and then the row is `i`.
 fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
     rows.map_or(i, |rows| rows[i] as usize)
 }

@@ -85,8 +85,9 @@ impl MotionModel for FrameByFrame {
 }
 
 impl ProxyRule for FrameByFrame {
-    /// Returns the stored parameters of the leaders (the most important members of the clusters) unchanged: Gaussians
-    /// of different frames cannot be merged, so their clusters are refused.
+    /// Returns for each cluster the stored parameters of its leader (most important member) unchanged. A Gaussian that
+    /// is visible in one frame cannot replace members of other frames. The caller compares each returned Gaussian with
+    /// its cluster at every frame, and refuses it if they differ.
     fn propose(model: &MotionModelFrames<Self>, clusters: &[Cluster], _: &MergeParams) -> Result<StoredParams> {
         let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
         Ok(model.raw().pick(&leaders))

@@ -39,7 +39,7 @@ struct WindowedModel<L: ProxyRule> {
     name: &'static str,
     /// Kind of output that has the format of this file.
     own: OutputKind,
-    /// Origin of the time stamps of frames: whether frames can be at any time.
+    /// How the times of frames are determined: frames can be at any time, or the file fixes their number or times.
     timing: TimeOrigin,
     /// Notes for the user: repairs and guesses made while the file was opened.
     notes: Vec<String>,

@@ -268,8 +268,8 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
 /// Input of merging, kept in memory so that merging can be tried on many sets of survivors (Gaussians left by pruning).
 struct Trial<'a> {
     scored: &'a Scored,
-    /// Merge parameters of the recipe, with the motion noise raised to at least twice the distance between neighboring
-    /// f32 values at the scene's largest coordinate.
+    /// Merge parameters of the recipe. `motion_noise` (noise of a step from frame to frame, when motions are compared)
+    /// is raised to at least twice the distance between neighboring f32 values at the scene's largest coordinate.
     merge: recipe::MergeParams,
     /// Ids, in increasing order, of the Gaussians whose states are in memory. These Gaussians are called the pool.
     pool: Vec<u32>,
@@ -278,11 +278,12 @@ struct Trial<'a> {
     /// Merge class of each Gaussian in the pool (Gaussians in memory). Only Gaussians of the same class may merge.
     /// `None`: the Gaussian never merges.
     classes: Vec<Option<u8>>,
-    /// Importances of all Gaussians, by id: contribution C, and fraction Vis of the views that may show the Gaussian.
+    /// Two importances of all Gaussians, by id: contribution C, and Vis, the fraction of the views in which the
+    /// Gaussian is alive and on screen.
     importance: [Cow<'a, [f64]>; 2],
     meter: PairMeter<'a>,
     work: &'a Cache,
-    /// Maximum number of pairs whose motion is measured at the same time.
+    /// Maximum number of pairs of Gaussians whose motion is compared at the same time.
     pairs_together: usize,
     /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors
     /// (Gaussians left by pruning) that is tried.

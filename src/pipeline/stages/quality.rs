@@ -37,12 +37,12 @@ const MOST_VIEWS: usize = 60;
 const FEWEST_VIEWS: usize = 4;
 /// Fraction of the run's estimated processor time that measuring quality may take.
 const MAX_TIME_FRACTION: f64 = 0.02;
-/// Maximum number of times that the frames of the measured views are read: for the original, for the result (whose
-/// frames are computed from the same input) and for the timed views.
+/// Assumed maximum number of times that the stage reads the frames of the measured views, for the estimate of its
+/// reads: for the original, for the result (whose frames are computed from the same input) and for the timed views.
 const READS: f64 = 2.5;
-/// Maximum number of times that the frames of the measured views are read for a result with proxies (Gaussians that
-/// replace merged clusters). It is higher than [`READS`] because the members of a cluster lie in several blocks of the
-/// input.
+/// Assumed maximum number of times that the stage reads the frames of the measured views if the result has proxies
+/// (Gaussians that replace merged clusters). It is higher than [`READS`], the number without proxies, because the
+/// members of a cluster lie in several blocks of the input.
 const MERGED_READS: f64 = 6.0;
 /// Bytes that must remain free within the memory limit, beyond the estimate: this optional stage runs only if memory is
 /// plentiful.
@@ -187,7 +187,7 @@ impl QualityStage {
     }
 }
 
-/// Approximate processor time of PSNR and SSIM per pixel, seconds (`benches/filters.rs`).
+/// Approximate processor time of computing PSNR and SSIM, seconds per pixel of a view (`benches/filters.rs`).
 const SCORE_SECONDS_PER_PIXEL: f64 = 6e-8;
 
 /// Returns the mean PSNR, dB, and the mean SSIM of renders of `result` against renders of the original over `views`.

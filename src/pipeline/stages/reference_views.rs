@@ -24,12 +24,13 @@ const DEFAULT_LOSS: f64 = 0.5;
 /// PSNR of the result against the original, dB, above which the errors of pruning are too small to hide quantization
 /// noise. The archive then has to reach this PSNR against the result before quantization.
 const ENOUGH_PSNR: f64 = 50.0;
-/// Surplus of PSNR, dB, that a search for a quality reserves for the later quantization of an archive. With it,
-/// quantization may add a third of the squared error of pruning: 10·log10(1 + 1/3) ≈ 1.2. A third is the best
-/// trade-off, because a relative growth of the error of pruning saves about three times as many bytes as the same
-/// growth of the error of quantization.
+/// Loss of PSNR, dB, that a run allows for the quantization of an archive. A search for a requested PSNR therefore
+/// looks for a model that exceeds the request by this amount. Quantization may then add a third of the squared error of
+/// pruning: 10·log10(1 + 1/3) ≈ 1.2. A third is the best trade-off: raising the error of pruning by some percentage
+/// saves about three times as many bytes as raising the error of quantization by the same percentage.
 pub(crate) const ARCHIVE_HEADROOM: f64 = 1.2;
-/// Maximum amount by which the PSNR of an archive may be below its target, dB.
+/// Maximum amount, dB, by which an archive may miss its required PSNR against the result before quantization. If it
+/// misses more, the run fails.
 const MAX_SHORTFALL: f64 = 10.0;
 /// Bytes of memory per pixel of a rendered view.
 pub(crate) const BYTES_PER_PIXEL: u64 = 3 * size_of::<f32>() as u64;
@@ -40,14 +41,16 @@ pub(crate) const BALANCING_ROUNDS: usize = 2;
 const MAX_STEP_CHANGE: f64 = 2.5;
 /// Smallest mean squared error of renders that is distinguished from 0.
 const MIN_ERROR: f64 = 1e-14;
-/// Range, in octaves (doublings), of the common change of all quantization steps that follows the balancing rounds:
-/// from the finest to the coarsest steps.
+/// Range of the search for the coarsest quantization steps (or error bounds) with which an archive has the required
+/// PSNR. The search follows the balancing rounds ([`BALANCING_ROUNDS`]) and multiplies all steps by one common factor.
+/// First value: log2 of the factor for the finest steps; second value: for the coarsest steps.
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
-/// Number of bisection steps that find the common change of all quantization steps within [`OCTAVE_RANGE`].
+/// Number of bisection steps of the search in [`OCTAVE_RANGE`] for the coarsest quantization steps with which an
+/// archive has the required PSNR.
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
-/// Range, in octaves (doublings), in which the common change of all quantization steps is searched if the archive has a
-/// byte limit: from the coarsest to the finest steps. The search follows the balancing rounds, and finds the finest
-/// steps with which the archive fits the limit.
+/// Range of the search for the finest quantization steps (or error bounds) with which an archive fits a byte limit. The
+/// search follows the balancing rounds ([`BALANCING_ROUNDS`]) and multiplies all steps by one common factor. First
+/// value: log2 of the factor for the coarsest steps; second value: for the finest steps.
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
 /// Number of bisection steps of the search in [`BYTES_OCTAVE_RANGE`] for the finest quantization steps with which an
 /// archive fits its byte limit. Each bisection step encodes an archive and halves the range.
@@ -158,14 +161,15 @@ impl ReferenceViews<'_> {
         Ok(rendered)
     }
 
-    /// Returns the mean PSNR of renders of `source` against the reference renders, dB.
+    /// Returns the mean PSNR, dB, of renders of `source` against the stored renders of the reference model (usually the
+    /// result before quantization).
     pub(crate) fn psnr(&self, source: &dyn FrameSource) -> Result<f64> {
         let found = self.render(source, |k, image| psnr(&image, &self.images[k]))?;
         Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
     }
 
-    /// Returns the mean squared error of renders of `source` against the reference renders. Color values are from 0 to
-    /// 1.
+    /// Returns the mean squared error of renders of `source` against the stored renders of the reference model (usually
+    /// the result before quantization). Color values are from 0 to 1.
     pub(crate) fn error(&self, source: &dyn FrameSource) -> Result<f64> {
         let found = self.render(source, |k, image| 10f64.powf(-0.1 * psnr(&image, &self.images[k])))?;
         Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)

@@ -32,8 +32,8 @@ use crate::scene::Scene;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "rounds";
 
-/// Stage that ranks Gaussians in pruning rounds. A round measures the removal error of the survivors, ranks them and
-/// removes the lowest.
+/// Stage that ranks Gaussians in pruning rounds. A round ranks the survivors (Gaussians not removed so far) by removal
+/// error, the squared error of renders caused by removing one of them, and removes the lowest-ranked.
 #[derive(Debug, Clone)]
 pub(crate) struct Rounds {
     /// Fraction of the remaining Gaussians that one pruning round keeps.
@@ -47,18 +47,18 @@ pub(crate) struct Rounds {
     /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
     /// color of its background.
     pub contrast_floor: f64,
-    /// Smallest fraction of the Gaussians of the input that the last round may leave, as assumed in estimates; it
-    /// bounds the number of rounds.
+    /// Smallest fraction of the Gaussians of the input that the last pruning round may leave, as assumed in estimates.
+    /// It bounds the number of pruning rounds.
     pub fewest: f64,
-    /// Fraction of the Gaussians of the input that the last round usually leaves; used for estimates of time.
+    /// Fraction of the Gaussians of the input that the last pruning round usually leaves; used for estimates of time.
     pub usual: f64,
 }
 
-/// Value of [`Rounds::fewest`] (smallest fraction of the Gaussians that the last round is assumed to leave) if the user
-/// requests no number of Gaussians.
+/// Value of [`Rounds::fewest`] (smallest fraction of the Gaussians that the last pruning round is assumed to leave) if
+/// the user requests no number of Gaussians.
 const MIN_LEFT: f64 = 0.05;
-/// Value of [`Rounds::usual`] (fraction of the Gaussians that the last round usually leaves) if the user requests no
-/// number of Gaussians.
+/// Value of [`Rounds::usual`] (fraction of the Gaussians that the last pruning round usually leaves) if the user
+/// requests no number of Gaussians.
 const USUAL_LEFT: f64 = 0.5;
 
 /// Adds the stage that ranks Gaussians in pruning rounds to `stages` if Gaussians are pruned by a ranking on rendered
@@ -135,9 +135,9 @@ impl Rounds {
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
-    /// Returns the number of rounds until at most the fraction `fewest` of the Gaussians is left. It is at most 2207,
-    /// because the fraction left by a round is at most [`MAX_ROUND_FRACTION`](recipe::MAX_ROUND_FRACTION) and there are
-    /// at most `u32::MAX` Gaussians.
+    /// Returns the number of pruning rounds until at most the fraction `fewest` of the Gaussians is left. It is at most
+    /// 2207, because the fraction left by a round is at most [`MAX_ROUND_FRACTION`](recipe::MAX_ROUND_FRACTION) and
+    /// there are at most `u32::MAX` Gaussians.
     fn rounds(&self, fewest: f64) -> u32 {
         let fewest = fewest.max(1.0 / f64::from(u32::MAX));
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
@@ -303,7 +303,7 @@ impl Rounds {
 /// State of the ranking between two pruning rounds.
 #[derive(Serialize, Deserialize)]
 struct RoundState {
-    /// Ids of the survivors (Gaussians not removed so far) that later rounds may remove, most important first.
+    /// Ids of the survivors (Gaussians not removed so far) that later pruning rounds may remove, most important first.
     free: Vec<u32>,
     /// Ids of the Gaussians removed so far, least important last.
     removed: Vec<u32>,

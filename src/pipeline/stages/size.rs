@@ -24,13 +24,14 @@ use crate::scene::Scene;
 
 /// Name of both stages in plans, progress and summaries.
 const NAME: &str = "size";
-/// Fraction of the byte limit that may remain unused. The search for the number of Gaussians that fit the limit ends
-/// once at most this fraction is unused.
+/// Fraction of the byte limit (requested size on disk) that may remain unused. The search for the number of Gaussians
+/// that fit the limit ends once at most this fraction is unused.
 const MAX_UNUSED: f64 = 0.01;
 /// Maximum number of trials in the search for the number of Gaussians that fits the byte limit. Each trial writes an
 /// output with one number of Gaussians and measures its bytes.
 const MAX_TRIED: usize = 8;
-/// Number of views by which Gaussians are ranked if the result exceeds the byte limit.
+/// Number of views by which Gaussians are ranked to remove some of them, if the result exceeds the requested size on
+/// disk.
 const RANKING_VIEWS: usize = 48;
 
 /// Adds to `stages` the stage that finds how many Gaussians fit the requested size on disk, if a size is requested.
@@ -48,7 +49,7 @@ pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     }
 }
 
-/// Stage that finds how many Gaussians fit the byte limit.
+/// Stage that finds how many Gaussians an output of at most the requested size on disk can hold.
 #[derive(Debug)]
 struct CountByBytes {
     limit: ByteLimit,
@@ -72,7 +73,7 @@ impl Stage for CountByBytes {
     }
 }
 
-/// Stage that removes Gaussians from a result above the byte limit.
+/// Stage that removes Gaussians from a result whose files exceed the requested size on disk.
 #[derive(Debug)]
 struct ShrinkToBytes {
     limit: ByteLimit,

@@ -1,4 +1,5 @@
-//! Scan of single blocks of Gaussians, and the data that the scans of all blocks share.
+//! Scan (pass over all frames that computes statistics) of single blocks of Gaussians, and the data that the scans of
+//! all blocks share.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -10,10 +11,10 @@ use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::statistics::{BlockScan, ScanPlan, attributes_to_read};
 
-/// Data that the scans of all blocks of Gaussians share.
+/// Data that is shared by the scans (passes over all frames that compute statistics) of all blocks of Gaussians.
 pub(crate) struct BlockScans<'a> {
     pub(crate) source: &'a dyn FrameSource,
-    /// Cameras that see each frame.
+    /// Views at each frame, with their cameras.
     pub(crate) schedule: &'a ViewSchedule,
     pub(crate) plan: &'a ScanPlan,
     /// Numbers of the blocks of Gaussians to scan.

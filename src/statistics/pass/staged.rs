@@ -22,11 +22,12 @@ use crate::error::{Error, Result};
 use crate::model::StatisticRows;
 use crate::source::{BlockReader, Ids, Prefetch};
 
-/// Maximum number of units of work per lane (a decoding thread and an accumulating thread) whose bytes have been
-/// fetched and that wait to be decoded.
+/// Maximum number of units of work (a block of Gaussians at some frames) that wait to be decoded after their bytes have
+/// been fetched. Applies to each lane (a decoding thread and an accumulating thread).
 const FETCHED: usize = 4;
 
-/// Unit of work: a block of Gaussians at the frames of one frame block (the frames that share a tile of the container).
+/// Unit of work: a block of Gaussians at the frames of one frame block (consecutive frames that the source stores
+/// together).
 struct Unit {
     block: usize,
     frames: Range<usize>,

@@ -43,7 +43,7 @@ impl Scores {
 /// Term of a score: a quantity and its normalization.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
-    /// Quantity that the term normalizes.
+    /// Quantity of a Gaussian, such as its contribution, that this term of a score normalizes.
     #[serde(rename = "of")]
     pub quantity: ScoredQuantity,
     /// Normalization of the quantity, from its percentiles over all Gaussians.
@@ -57,9 +57,9 @@ pub enum ScoredQuantity {
     By(Statistic),
     /// √(C·W): geometric mean of the contribution C and the largest weight W in any pixel.
     Geometric,
-    /// Static score S_static.
+    /// Static score S_static, computed from contribution and anisotropy.
     Static,
-    /// Dynamic score S_dynamic.
+    /// Dynamic score S_dynamic, computed from motion, opacity variance and life span.
     Dynamic,
 }
 

@@ -10,13 +10,15 @@ use crate::recipe;
 /// P99; clipped to [0, 1] if the recipe asks for it.
 ///
 /// If P99 ≤ P1 (at most 1% of the values differ from the rest), there is no scale to normalize by. norm is then 1 above
-/// P99 and 0 elsewhere, and the term is *inactive*. This rule also applies if ε > 0: dividing by ε = 1e-8 would let the
-/// few different values outweigh every other term by a factor of a million.
+/// P99 and 0 elsewhere, and the score term that uses it is called *inactive*. This rule also applies if ε > 0: dividing
+/// by ε = 1e-8 would let the few different values outweigh every other term by a factor of a million.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Norm {
-    /// 1st percentile by nearest rank (always one of the values); 0 if there are no values.
+    /// 1st percentile P1 of the quantity; 0 if it has no values. Either one of its values (nearest rank) or, with
+    /// [`PercentilePasses::One`], the middle of a histogram bucket.
     pub p1: f64,
-    /// 99th percentile by nearest rank (always one of the values); 0 if there are no values.
+    /// 99th percentile P99 of the quantity; 0 if it has no values. Either one of its values (nearest rank) or, with
+    /// [`PercentilePasses::One`], the middle of a histogram bucket.
     pub p99: f64,
     epsilon: f64,
     clip: bool,
@@ -27,8 +29,9 @@ pub struct Norm {
 pub enum PercentilePasses {
     /// Two passes over the values, which find the exact percentile.
     Two,
-    /// One pass, with a histogram. The number is how many mantissa bits of a value are part of the key of its histogram
-    /// bucket. The result is the middle of the bucket that contains the percentile.
+    /// One pass, which counts the values in a histogram. The result is the middle of the bucket that contains the
+    /// percentile. The number is how many mantissa bits of a value (as f32) select its bucket: with more bits, buckets
+    /// are narrower.
     One(u32),
 }
 

@@ -7,9 +7,10 @@
 //! result does not depend on the order of the values. Rank-error sketches (KLL, t-digest) are random or depend on the
 //! order, and were off by 3–47% in value at P99 of a heavy tail.
 
-/// Default number of mantissa bits of a histogram key.
+/// Default number of mantissa bits of a histogram key (upper bits of an f32 value, which select its bucket).
 const MANTISSA_BITS: u32 = 7;
-/// Maximum number of mantissa bits of a histogram key; the counts then take 16 MiB.
+/// Maximum number of mantissa bits of a histogram key (upper bits of an f32 value, which select its bucket). With this
+/// number, the counts take 16 MiB.
 pub const MAX_MANTISSA_BITS: u32 = 13;
 /// Number of mantissa bits that an f32 stores.
 const ALL_BITS: u32 = 23;
@@ -17,7 +18,7 @@ const ALL_BITS: u32 = 23;
 /// Histogram of f64 values, from which percentiles are computed. Holds at most 2³² − 1 values. NaN and infinities are
 /// not counted.
 pub struct FloatSketch {
-    /// Number of low f32 mantissa bits that a histogram key omits.
+    /// Number of low mantissa bits of an f32 value that its histogram key (the remaining upper bits) omits.
     dropped: u32,
     counts: Vec<u32>,
     finite: u64,
@@ -51,8 +52,8 @@ impl FloatSketch {
     }
 
     /// Returns the `p`-th percentile (`p` from 0 to 100) by nearest rank: the value of rank ⌈p·n/100⌉, at least 1,
-    /// among the n finite values; `None` if n = 0. `values` must be the values that were counted. The values of one
-    /// bucket are copied; in the worst case, all values lie in it.
+    /// among the n finite values; `None` if n = 0. `values` must be the values that were counted. Copies the values in
+    /// the histogram bucket of the percentile; in the worst case, these are all values.
     pub fn percentile(&self, p: f64, values: impl IntoIterator<Item = f64>) -> Option<f64> {
         let (bucket, rank) = self.locate(p)?;
         let mut inside: Vec<f64> =

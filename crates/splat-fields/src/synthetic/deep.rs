@@ -10,7 +10,7 @@ const WIDTH: usize = 22;
 /// Number of values in the encoding of a position: its 3 components, and their sines and cosines in 10 octaves.
 const POSITION_INPUTS: usize = 3 + 2 * 3 * 10;
 
-/// Variant of the architecture of the network.
+/// Variant of the architecture of the deep MLP that [`random_tensors`] makes.
 #[derive(Clone, Copy, Debug)]
 pub struct DeepVariant {
     /// Whether a separate network encodes the time.
@@ -21,7 +21,8 @@ pub struct DeepVariant {
     pub all_heads: bool,
 }
 
-/// Variants to test. Each option is on in at least one variant and off in another.
+/// Variants of the deformation network that tests evaluate. Each option is on in at least one variant and off in
+/// another.
 pub const ALL_VARIANTS: [DeepVariant; 3] = [
     DeepVariant { time_network: true, screws: false, all_heads: false },
     DeepVariant { time_network: false, screws: true, all_heads: false },

@@ -67,9 +67,9 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
 struct Mount {
     /// Path of the mounted group within the hierarchy of control groups; `/` if the whole hierarchy is mounted.
     root: PathBuf,
-    /// Folder at which the hierarchy is mounted.
+    /// Folder of the file system at which the hierarchy of control groups is mounted (mount point).
     point: PathBuf,
-    /// File system type: `cgroup2`, or `cgroup` for version 1.
+    /// File system type of the mount: `cgroup2`, or `cgroup` for control groups of version 1.
     kind: String,
     /// Whether the control groups of this hierarchy can limit memory. Some hierarchies of version 1 cannot.
     limits_memory: bool,

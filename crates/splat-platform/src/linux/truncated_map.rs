@@ -10,7 +10,7 @@ use std::sync::OnceLock;
 
 use crate::TruncatedMapMessage;
 
-/// Message that the signal handler writes. It is set before the handler is installed.
+/// Message that the handler of SIGBUS writes if a mapped file was truncated. It is set before the handler is installed.
 static MESSAGE: OnceLock<TruncatedMapMessage> = OnceLock::new();
 
 /// Installs a handler for the case that this process accesses a mapped file that another program has truncated. The
@@ -94,25 +94,25 @@ fn path_mapped_at(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
 
 /// Parser that reads a line of `/proc/self/maps` byte by byte: `START-END MODE OFFSET DEVICE INODE PATH`.
 struct MapsLine {
-    /// Start and end address of the memory region that the line describes.
+    /// START and END: the addresses between which the memory region described by the line lies.
     range: [usize; 2],
-    /// Index of the field of the line that is being read: 0 for START, 1 for END, and so on up to 6 for PATH. START
-    /// ends at a dash, the following fields end at a run of blanks.
+    /// Index of the field of the line of `/proc/self/maps` that is being read: 0 for START, 1 for END, and so on up to
+    /// 6 for PATH. START ends at a dash, each of the other fields before PATH at a run of blanks.
     field: usize,
-    /// Whether the last byte was a blank.
+    /// Whether the last byte read was a blank. Further blanks then belong to the same run, and end no further field.
     after_blank: bool,
-    /// Number of bytes of the path read so far.
+    /// Number of bytes of the field PATH read so far.
     length: usize,
 }
 
 impl MapsLine {
-    /// Creates a parser that has read nothing of its line.
+    /// Creates a parser at the start of a line, with no byte read.
     fn new() -> MapsLine {
         MapsLine { range: [0; 2], field: 0, after_blank: false, length: 0 }
     }
 
-    /// Reads `byte`, the next byte of the line. Appends it to `path` if it belongs to the path at the end of the line;
-    /// a control character becomes `?`.
+    /// Reads `byte`, the next byte of a line of `/proc/self/maps`. Appends the byte to `path` if it belongs to the file
+    /// path at the end of the line; a control character becomes `?`.
     fn push(&mut self, byte: u8, path: &mut [u8; PATH_BYTES]) {
         const PATH: usize = 6;
         if self.field < PATH && (byte == b' ' || self.field == 0 && byte == b'-') {

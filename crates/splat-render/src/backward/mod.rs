@@ -40,8 +40,8 @@ pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<Spla
 /// A strip (the tiles that are processed together) with more pairs is processed in parts.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
-/// Bytes of memory for the (splat, tile) pairs of a strip of tiles, for a render and for the gradient of a loss of this
-/// render.
+/// Bytes of memory for the (splat, tile) pairs of one strip (the tiles that are processed together), for a render and
+/// for the gradient of a loss of this render.
 pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<SplatSums<f32>>();
 
 impl Renderer {

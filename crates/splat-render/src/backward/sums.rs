@@ -1,5 +1,5 @@
-//! Gradient sums: sums over pixels from which the gradients of splats are computed, per tile that a splat touches and
-//! over all tiles.
+//! Gradient sums: sums over pixels from which the gradients of splats are computed. There are sums over the pixels of
+//! one tile, and sums over the pixels of all tiles.
 
 /// Sums over pixels from which the gradients of one splat are computed: f32 sums over a tile in a fixed order, or f64
 /// sums over tiles.
@@ -21,7 +21,7 @@ pub(super) struct SplatSums<T> {
 }
 
 impl SplatSums<f64> {
-    /// Adds `tile`, the sums over the pixels of one tile.
+    /// Adds `tile`, the sums of the same splat over the pixels of one tile.
     #[inline(always)]
     pub(super) fn add(&mut self, tile: &SplatSums<f32>) {
         self.p += f64::from(tile.p);
@@ -34,9 +34,9 @@ impl SplatSums<f64> {
 /// Gradient sums ([`SplatSums`], sums over pixels) of all splats of a render.
 #[derive(Debug, Default)]
 pub(in super::super) struct ImageGradientSums {
-    /// Sums of every splat over the pixels of all tiles.
+    /// Gradient sums ([`SplatSums`]) of each splat over the pixels of all tiles.
     pub(super) totals: Vec<SplatSums<f64>>,
-    /// Sums of each splat over the pixels of one tile, for every (splat, tile) pair of a strip of tiles or of a part of
-    /// the strip.
+    /// Gradient sums ([`SplatSums`]) over the pixels of one tile, for each (splat, tile) pair of the tiles that are
+    /// processed now.
     pub(super) pairs: Vec<SplatSums<f32>>,
 }

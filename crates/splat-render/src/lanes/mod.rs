@@ -103,7 +103,7 @@ pub(super) trait Lanes: Copy {
     fn max(self, other: Self) -> Self;
     /// Returns the mask of the lanes with `self ≥ other`, which is false for NaN.
     fn at_least(self, other: Self) -> Self::Mask;
-    /// Returns the mask of the lanes that are set in both `a` and `b`.
+    /// Returns the mask that is set in the lanes in which both `a` and `b` are set.
     fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
     /// Returns `mask` as an integer with one bit per lane.
     fn bits(mask: Self::Mask) -> u32;
@@ -119,12 +119,12 @@ pub(super) trait Lanes: Copy {
     fn largest(self) -> f32;
     /// Adds each group of the vector to `sums` lane by lane, one group after the other, and returns the result.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
-    /// Adds the groups of the vector to two sums, the groups with even index to one and the groups with odd index to
-    /// the other, and returns the sums. A vector of one group is always added to the first of the two sums, see
+    /// Adds the groups of the vector to `sums`, the groups with even index to one of the two sums and the groups with
+    /// odd index to the other. Returns the new sums. A vector of one group is always added to the first sum; see
     /// [`EvenOddSums`].
     fn add_to_even_odd(self, sums: Self::EvenOddSums) -> Self::EvenOddSums;
-    /// Returns `self · 2ⁿ` in each lane, for the integer n in this lane. `rounded` is n + [`ROUND`], whose low bits
-    /// hold n.
+    /// Returns `self · 2ⁿ` in each lane, for an integer n per lane. The same lane of `rounded` holds n + [`ROUND`], a
+    /// number whose low bits are n.
     fn scale(self, rounded: Self) -> Self;
 
     /// Computes 2^x of each lane x ≤ 0. The relative error is below 1.6e-7 down to 2⁻¹²⁶; for smaller x, the result is
@@ -144,25 +144,26 @@ pub(super) trait Lanes: Copy {
     }
 }
 
-/// Two sums of groups of eight lanes: one of the groups with even index, one of the groups with odd index. Groups are
-/// added lane by lane, so each of the two sums has eight values.
+/// Two sums of groups of eight lanes: one over the groups with even index, one over the groups with odd index. Groups
+/// are added lane by lane, so each of the two sums has eight values.
 ///
-/// The two groups of an AVX-512 vector are added to different sums, so that neither addition waits for the other. A
-/// vector of one group is always added to the first sum. The caller swaps the two sums after all groups with even
-/// index, and again after all groups with odd index.
+/// How a vector is added ([`Lanes::add_to_even_odd`]) depends on its number of groups:
+/// - Two groups (AVX-512): one group is added to each of the two sums, so that neither addition waits for the other.
+/// - One group: it is added to the first of the two sums. The caller first adds all groups with even index, swaps the
+///   two sums ([`EvenOddSums::swapped`]), adds all groups with odd index, and swaps them again.
 pub(super) trait EvenOddSums: Copy {
     type Sums: Sums;
     /// Returns sums that are all 0.
     fn zero() -> Self;
-    /// Returns the two sums, in swapped order if a vector has one group. Groups that are added later then go to the
-    /// other sum. If a vector has two groups, returns the sums unchanged.
+    /// Returns the two sums in swapped order if a vector has one group, so that the next groups are added to the other
+    /// sum. Returns them unchanged if a vector has two groups, which are added to both sums at once.
     fn swapped(self) -> Self;
     /// Returns the even sum plus the odd sum in each lane.
     fn combined(self) -> Self::Sums;
 }
 
-/// Even and odd sums for vectors of one group. Groups are added to the first entry. The caller swaps the entries after
-/// all groups with even index, and again after all groups with odd index.
+/// Two sums for vectors of one group, which are always added to the first entry. The caller swaps the entries after all
+/// groups with even index, and again after all groups with odd index, so each entry sums one kind of groups.
 impl<V: Sums> EvenOddSums for [V; 2] {
     type Sums = V;
     #[inline(always)]

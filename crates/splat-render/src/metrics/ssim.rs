@@ -84,7 +84,7 @@ struct Moments {
     /// Windowed sums of a, b, a² + b² and a·b at every pixel. SSIM needs only the sum of the two variances, hence a² +
     /// b².
     sums: [Vec<f64>; 4],
-    /// Buffer for the result of applying the window along rows, before it is applied along columns.
+    /// Buffer for one image channel that was weighted with the window along its rows, but not yet along its columns.
     scratch: Vec<f64>,
 }
 
@@ -114,9 +114,9 @@ impl Moments {
     }
 }
 
-/// Factors of the SSIM S = (A₁A₂)/(B₁B₂) at one pixel, and the windowed means of both images.
+/// Factors of the SSIM S = (A₁A₂)/(B₁B₂) at one pixel, and the means of both images around this pixel.
 struct Terms {
-    /// Windowed means of the images a and b.
+    /// Means of the images a and b, weighted by the Gaussian window around the pixel.
     means: [f64; 2],
     /// Factors A₁ and A₂ of the numerator of the SSIM S = (A₁A₂)/(B₁B₂).
     numerators: [f64; 2],
