@@ -85,9 +85,12 @@ impl OutputKind {
     }
 
     fn from_name(path: &Path) -> Option<OutputKind> {
-        // This ending has two parts, of which the second one alone means an ordinary PLY.
-        if path.file_name()?.to_str()?.to_ascii_lowercase().ends_with(".ftgs.ply") {
+        // These endings have two parts, of which the second one alone means an ordinary PLY.
+        if ends_with(path, ".ftgs.ply") {
             return Some(OutputKind::Ftgs);
+        }
+        if ends_with(path, ".compressed.ply") {
+            return None;
         }
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
             "gseq" => Some(OutputKind::Gseq),
@@ -180,10 +183,19 @@ pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
 /// - `path` is an existing folder, which may have any name.
 fn foreign_ending(path: &Path) -> Option<&str> {
     const WITH_DIGITS: [&str; 7] = ["mp4", "4dgs", "splat4d", "h5", "hdf5", "7z", "bz2"];
+    if ends_with(path, ".compressed.ply") && !path.is_dir() {
+        return Some("compressed.ply");
+    }
     let ending = path.extension()?.to_str()?;
     let only_letters = ending.chars().all(|c| c.is_ascii_alphabetic());
     let known = only_letters || WITH_DIGITS.iter().any(|known| ending.eq_ignore_ascii_case(known));
     Some(ending).filter(|ending| known && !ending.is_empty() && !path.is_dir())
+}
+
+/// Returns whether the file name `path` ends with `ending`, in upper or lower case. `ending` is in lower case.
+fn ends_with(path: &Path, ending: &str) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str());
+    name.is_some_and(|name| name.to_ascii_lowercase().ends_with(ending))
 }
 
 #[cfg(test)]
@@ -200,7 +212,7 @@ mod tests {
     #[test]
     fn unknown_endings_are_refused_with_the_possible_ones() {
         let refused = |name: &str| OutputKind::check_name(Path::new(name)).err().map(|error| error.to_string());
-        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.fbx"] {
+        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.fbx", "x.compressed.ply"] {
             let message = refused(name).expect(name);
             for part in [name, "NAME.gsz", "NAME.gseq", "NAME.ply", "a folder", "--as"] {
                 assert!(message.contains(part), "{part:?} is not in {message:?}");
