@@ -67,7 +67,7 @@ pub struct CurveForm {
 }
 
 impl CurveForm {
-    /// Cubic motion, linear rotation, and time windows of any width.
+    /// Form of curves with cubic motion, linear rotation, and time windows of any width.
     pub const CUBIC: CurveForm = CurveForm { has_linear_motion: false, min_width: 0.0, max_intervals: 32 };
 
     /// Returns the form with linear motion, constant rotation, and time windows of at least `min_width` units of time.
@@ -82,8 +82,8 @@ impl CurveForm {
         CurveForm { max_intervals, ..self }
     }
 
-    /// Returns the numbers of intervals to try, in this order. An interval lies between the centers of two neighboring
-    /// overlapping curves, so n intervals take n + 1 curves.
+    /// Returns the numbers n to try, in this order, for fits by n + 1 overlapping curves. The centers of their time
+    /// windows divide the visible time of the Gaussian into n intervals.
     fn intervals(self) -> &'static [usize] {
         if self.has_linear_motion { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32] } else { &[2, 4, 8, 16, 32] }
     }
@@ -103,6 +103,9 @@ const CONVERGED: f64 = 1e-3;
 const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
+/// Distance in time from the center of a window, in widths of the window, from which on the window counts as 0. Its true
+/// value there is exp(−36).
+const MAX_WIDTHS: f64 = 6.0;
 /// Limit that decides which frames the fit of a curve uses:
 /// - The fit of the opacities of overlapping curves uses frames at which the time window is above this value.
 /// - The fit of the motion uses frames whose weight (window × opacity) is above this value times
@@ -147,7 +150,8 @@ pub fn fit_curves(
 }
 
 fn window(time: f64, center: f64, width: f64) -> f64 {
-    (-((time - center) / width).powi(2)).exp()
+    let widths = (time - center) / width;
+    if widths.abs() < MAX_WIDTHS { (-widths * widths).exp() } else { 0.0 }
 }
 
 fn depth(opacity: f64) -> f64 {
@@ -164,9 +168,9 @@ fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
-/// Returns one curve for `track` (states of a Gaussian at all frames). The logarithm of its opacity is a parabola in
-/// time, fitted to the visible frames with the squared opacity as weight. The fit is exact if the opacity of `track` is
-/// a time window, even if only a part of the window lies within the sequence.
+/// Returns one curve of the form `form` for `track` (states of a Gaussian at all frames). The logarithm of its opacity
+/// is a parabola in time, fitted to the visible frames with the squared opacity as weight. The fit is exact if the
+/// opacity of `track` is a time window, even if only a part of the window lies within the sequence.
 ///
 /// Returns `None` in these cases:
 /// - Fewer than three frames are visible.
@@ -196,8 +200,8 @@ fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     Some(CubicTrack { opacity: peak, ..curve })
 }
 
-/// Returns one curve for `track` (states of a Gaussian at all frames). Its time window has the same mean and the same
-/// variance over time as the opacity of the track.
+/// Returns one curve of the form `form` for `track` (states of a Gaussian at all frames). Its time window has the same
+/// mean and the same variance over time as the opacity of the track.
 fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
@@ -234,22 +238,25 @@ fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 
             (0..track.len()).map(share).filter(|(_, share)| *share > MIN_WEIGHT).collect()
         })
         .collect();
+    let sums: Vec<f64> = shares.iter().map(|shares| shares.iter().map(|(_, share)| share).sum()).collect();
     let most = target_depths.iter().copied().fold(0.0, f64::max);
     let mut depths = vec![most / 2.0; centers.len()];
-    let mut shown = vec![0.0; track.len()];
+    // For each frame: the product of the transmittances of all curves, then target depth divided by depth.
+    let mut ratios = vec![1.0; track.len()];
     for _ in 0..MAX_UPDATES {
         // A window multiplies the opacity, not the depth, so each curve adds the depth of its windowed opacity.
-        shown.fill(0.0);
+        ratios.fill(1.0);
         for (shares, d) in shares.iter().zip(&depths) {
             let opacity = 1.0 - (-d).exp();
-            shares.iter().for_each(|&(frame, share)| shown[frame] += depth(opacity * share));
+            shares.iter().for_each(|&(frame, share)| ratios[frame] *= 1.0 - (opacity * share).min(MAX_OPACITY));
+        }
+        for (ratio, target) in ratios.iter_mut().zip(&target_depths) {
+            *ratio = target / (-ratio.ln()).max(1e-9);
         }
         let mut moved = 0.0f64;
-        for (shares, depth) in shares.iter().zip(&mut depths) {
-            let ratio: f64 =
-                shares.iter().map(|&(frame, share)| share * target_depths[frame] / shown[frame].max(1e-9)).sum();
-            let weight: f64 = shares.iter().map(|(_, share)| share).sum();
-            let by = if weight > 0.0 { (ratio / weight).min(4.0) } else { 0.0 };
+        for ((shares, sum), depth) in shares.iter().zip(&sums).zip(&mut depths) {
+            let weighted: f64 = shares.iter().map(|&(frame, share)| share * ratios[frame]).sum();
+            let by = if *sum > 0.0 { (weighted / sum).min(4.0) } else { 0.0 };
             moved = moved.max((by - 1.0).abs().min(*depth));
             *depth = (*depth * by).min(self::depth(MAX_OPACITY));
         }
@@ -295,7 +302,6 @@ fn fit_motion(
     let mean = |value: &dyn Fn(usize) -> f64| {
         samples.iter().map(|&(frame, weight)| weight * value(frame)).sum::<f64>() / whole.max(1e-300)
     };
-    let width_of_sh = track.sh(0).len();
     let unscaled = |k: usize| reach.powi(k as i32);
     CubicTrack {
         center,
@@ -304,7 +310,10 @@ fn fit_motion(
         rotation: std::array::from_fn(|k| rotation[k].map(|value| value / unscaled(k))),
         log_scale: std::array::from_fn(|c| mean(&|frame| track.log_scale[frame][c])),
         opacity: 0.0,
-        sh: (0..width_of_sh).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
+        sh: match track.sh.as_slice() {
+            [constant] => constant.clone(),
+            _ => (0..track.sh(0).len()).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
+        },
     }
 }
 
@@ -321,27 +330,33 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
         let time = track.times[frame];
         let (mut shown, mut away) = (0.0, 0.0);
         let weight = tolerance.weight(track.opacity[frame]);
+        let own_depth = depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY);
+        let middle_scale = track.middle_scale(frame);
         for curve in curves {
-            let share = depth(curve.opacity_at(time));
+            let opacity = curve.opacity_at(time);
+            if opacity == 0.0 {
+                continue;
+            }
+            let share = depth(opacity);
             shown += share;
-            if curve.opacity_at(time) < MIN_VISIBLE_OPACITY {
+            if opacity < MIN_VISIBLE_OPACITY {
                 continue;
             }
             let dt = time - curve.center;
             let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
             let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
-            let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
-            let distance = track.distance_in_middle_scales(frame, curve.position_at(time));
+            let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let distance = track.distance(frame, curve.position_at(time)) / middle_scale;
             away += share * distance;
             worst = [
                 distance / tolerance.position,
                 track.rotation_error(frame, rotation) / tolerance.rotation,
                 scale / tolerance.log_scale,
-                sh / tolerance.sh,
+                f64::from(sh) / tolerance.sh,
             ]
             .into_iter()
             // A curve that is hardly visible in this frame need not be as close.
-            .map(|excess| excess * weight * (share / depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY)).min(1.0))
+            .map(|excess| excess * weight * (share / own_depth).min(1.0))
             .fold(worst, f64::max);
         }
         let apart = 1.0 - (-shown).exp() - track.opacity[frame];

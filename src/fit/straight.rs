@@ -87,7 +87,6 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let mean = |value: &dyn Fn(usize) -> f64| frames.clone().map(value).sum::<f64>() / count;
     let rotation: [f64; 4] = std::array::from_fn(|c| mean(&|frame| track.rotation[frame][c]));
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let width = track.sh(frames.start).len();
     LinearPiece {
         at,
         position,
@@ -95,7 +94,10 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
         rotation: if length > 1e-6 { rotation.map(|x| x / length) } else { track.rotation[frames.start] },
         log_scale: std::array::from_fn(|c| mean(&|frame| track.log_scale[frame][c])),
         opacity: mean(&|frame| track.opacity[frame]),
-        sh: (0..width).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
+        sh: match track.sh.as_slice() {
+            [constant] => constant.clone(),
+            _ => (0..track.sh(0).len()).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
+        },
         frames,
     }
 }

@@ -41,10 +41,10 @@ impl FittedTrack {
             track.rotation.push(last);
             track.log_scale.push(state.log_scale.row::<3>(row).map(f64::from));
             track.opacity.push(opacity(state.opacity_logit.row::<1>(row)[0]));
-            let sh: Vec<f32> = (0..state.sh.width()).map(|c| state.sh.plane(c)[row]).collect();
-            if track.sh.last() != Some(&sh) {
+            let sh = || (0..state.sh.width()).map(|c| state.sh.plane(c)[row]);
+            if !track.sh.last().is_some_and(|last| sh().eq(last.iter().copied())) {
                 track.sh.resize(track.position.len() - 1, track.sh.last().cloned().unwrap_or_default());
-                track.sh.push(sh);
+                track.sh.push(sh().collect());
             }
         }
         if track.sh.len() > 1 {
@@ -82,11 +82,15 @@ impl FittedTrack {
         scales[1].exp().max(1e-12)
     }
 
+    /// Returns the distance between `position` and the position of the Gaussian at `frame`, in scene units.
+    pub fn distance(&self, frame: usize, position: [f64; 3]) -> f64 {
+        position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+    }
+
     /// Returns the distance between `position` and the position of the Gaussian at `frame`, in units of the Gaussian's
     /// middle scale at `frame`.
     pub fn distance_in_middle_scales(&self, frame: usize, position: [f64; 3]) -> f64 {
-        let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-        apart / self.middle_scale(frame)
+        self.distance(frame, position) / self.middle_scale(frame)
     }
 
     /// Returns the angle between `rotation` and the rotation of the Gaussian at `frame`, radians; 0 for a nearly round
