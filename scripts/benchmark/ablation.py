@@ -3,10 +3,12 @@
 
     cargo build --release
     python3 scripts/benchmark/ablation.py target/release/splatsieve DATA [--models A,B] [--kept 40%,20%,10%,5%]
+        [--kinds stage,setting]
 
 Rows of kind `stage` add one stage after the other, from pruning by the paper's score to `default`, then take single
-parts of `default` away. Rows of kind `setting` change one parameter of `default`; they are measured at 10% only, and
-`robustness.py` compares `default` with the best of them for each model. PSNR is the mean over test views.
+parts of `default` away. Rows of kind `setting` change one parameter of `default`, and the first of them none; they are
+measured at 10% only, and `robustness.py` compares `default` with the best of them for each model. PSNR is the mean over
+test views.
 """
 
 import tempfile
@@ -17,12 +19,16 @@ from measuring import KEPT, Results, arguments, chosen, compress, evaluate
 
 PRUNE = ["--no-refine", "--prune-only"]
 SETTINGS = {
+    "default": [],
     "contrast_floor=0": ["contrast_floor=0"],
     "contrast_floor=0.3": ["contrast_floor=0.3"],
-    "round_pictures=96": ["round_pictures=96"],
+    "round_pictures=48, round_turns=4": ["round_pictures=48", "round_turns=4"],
     "round_fraction=0.8": ["round_fraction=0.8"],
-    "refine_ssim=0.2": ["refine_ssim=0.2"],
-    "static_term=mean": ["static_term=mean"],
+    "round_fraction=0.95": ["round_fraction=0.95"],
+    "refine_cut_steps=120": ["refine_cut_steps=120"],
+    "refine_pictures=260": ["refine_pictures=260"],
+    "refine_ssim=0.5": ["refine_ssim=0.5"],
+    "bands=0": ["bands=0"],
 }
 
 
@@ -49,8 +55,10 @@ def stages(kept):
 
 
 def main():
-    default = {"type": lambda text: text.split(","), "default": KEPT, "help": "fractions of the Gaussians to keep"}
-    args = arguments(__doc__, ("--kept", default))
+    words = {"type": lambda text: text.split(",")}
+    kept = ("--kept", words | {"default": KEPT, "help": "fractions of the Gaussians to keep"})
+    kinds = ("--kinds", words | {"default": ["stage", "setting"], "help": "kinds of rows to measure"})
+    args = arguments(__doc__, kept, kinds)
     columns = ["model", "kept", "kind", "setting", "gaussians", "bytes", "psnr_db", "ssim"]
     results = Results("ablation", args.program, columns)
     with tempfile.TemporaryDirectory() as scratch:
@@ -60,6 +68,7 @@ def main():
                 rows = [("stage", name, options) for name, options in stages(kept).items()]
                 if kept == "10%":
                     rows += [("setting", name, sets(*settings)) for name, settings in SETTINGS.items()]
+                rows = [row for row in rows if row[0] in args.kinds]
                 for kind, name, options in rows:
                     summary, _ = compress(args.program, model, output, "--ratio", kept, *options)
                     quality = evaluate(args.program, model, output)

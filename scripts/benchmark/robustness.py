@@ -15,7 +15,7 @@ def main():
     results = Results("robustness", args.program, ["model", "default_psnr_db", "best_setting", "best_psnr_db", "default_below_best_db"])
     differences, by_model = [], {}
     for row in read_results("ablation"):
-        if row["kept"] == "10%" and (row["kind"] == "setting" or row["setting"] == "default"):
+        if row["kind"] == "setting":
             by_model.setdefault(row["model"], {})[row["setting"]] = float(row["psnr_db"])
     for name, tried in by_model.items():
         best = max(tried, key=tried.get)
