@@ -205,9 +205,9 @@ impl RefineStage {
         let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
         let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
-        // With a deformation field, no reader is open while steps are made, and either two more states and what the
-        // field computes without time are held while states are evaluated again, or one state per thread while views
-        // are rendered.
+        // With a deformation field, no reader is open while steps are made. While states are evaluated again, two more
+        // states and what the field computes without time are held; while views are rendered, one state per thread and
+        // the renderer's buffers.
         let is_deformed = work.input.jacobian > 0;
         let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
         let left_readers = if is_deformed { [("readers", 0), ("held", 0)] } else { read };
@@ -217,9 +217,8 @@ impl RefineStage {
             ("mean", 2 * work.state_bytes(self.columns)),
             ("neighbors", NEIGHBOR_BYTES),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
-            ("prepared", work.input.prepared),
             ("result", work.input.reduced),
-            ("views", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
+            ("views", (2 * GRADIENT_BYTES_PER_VISIBLE as u64).max(work.input.prepared)),
         ];
         // Peak memory is the maximum of three phases: rendering the original, optimizing constant deltas of the
         // survivors (Gaussians left by pruning), and optimizing deltas that vary with time.

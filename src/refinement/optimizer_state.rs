@@ -241,6 +241,8 @@ impl<'a> OptimizerState<'a> {
     pub(super) fn reevaluate_states(&mut self) -> Result<()> {
         let Some(deformation) = self.deformation else { return Ok(()) };
         self.bake_delta();
+        // Frees the renderer's buffers. The memory plan counts them or what the field computes without time, not both.
+        self.renderer = Renderer::on_all_threads();
         let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
         let gaussians = deformation.with_params(&self.stored);
         for &frame in &self.frames {
@@ -291,8 +293,9 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the positions of all Gaussians at the first frame of the target views, with the constant delta (change
-    /// of the stored parameters) added.
+    /// Returns the present positions of all Gaussians at the first frame of the target views. They include the constant
+    /// delta: the change of the stored parameters since the start of refinement, which is the same at all frames. They
+    /// do not include the time-varying delta.
     pub(super) fn positions(&self) -> AttributeValues {
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return AttributeValues::default() };
         let mut moved = Gaussians { position: state.position.clone(), ..Gaussians::default() };
