@@ -84,9 +84,11 @@ mod tests {
         least_limit(system, |name| variables.get(name).map(|&value| value.to_owned())).0
     }
 
-    /// Returns the memory limit, bytes, of a process outside any batch job, and the description of its source. `shared`
-    /// and `process` are the limits that the system reports: of the machine and of groups of processes, and of the
-    /// process itself.
+    /// Returns the memory limit, bytes, of a process outside any batch job, and the description of its source. The
+    /// arguments are the limits that the system reports:
+    /// - `shared`: limits that the process shares with other processes: the memory of the machine, and limits of groups
+    ///   of processes;
+    /// - `process`: limits of this process alone.
     fn limit(shared: &[MemoryLimit], process: &[MemoryLimit]) -> (u64, String) {
         least_limit(MemoryLimits { shared: shared.to_vec(), process: process.to_vec() }, |_| None)
     }

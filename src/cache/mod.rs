@@ -246,20 +246,20 @@ impl Cache {
         }
     }
 
-    /// Chooses into how many shards (parts) `stage` is divided, and returns this number n; 1 means that it is not
-    /// divided. The caller then computes the shards that are not stored, and joins all n. To be called only if the full
-    /// result of `stage` is not stored.
+    /// Returns the number of shards (parts) into which `stage` is divided; 1 means that it is not divided. The caller
+    /// then computes the shards that are not stored, and joins all of them. To be called only if the full result of
+    /// `stage` is not stored.
     ///
     /// The work folder may hold shards from several runs that divided the stage into different numbers of shards. The
     /// first case that applies decides:
-    /// 1. There is no work folder: n is 1.
-    /// 2. All shards of a division into m shards are stored: n is m.
-    /// 3. The run is not limited to one shard: n is the number of shards of the division of which the largest fraction
-    ///    is stored. If no shard is stored, n is 1.
-    /// 4. The run is limited to shard 1 of 1: n is 1.
-    /// 5. The run is limited to one of several shards: returns no n. If `find` does not find the stored shard, `make`
-    ///    computes and stores it. In both cases the run then ends as intended, with the error [`Error::ShardDone`],
-    ///    which reports the missing shards.
+    /// - There is no work folder: returns 1.
+    /// - All shards of a division into m shards are stored: returns m.
+    /// - The run is not limited to one shard: returns the number of shards of the division of which the largest
+    ///   fraction is stored, or 1 if no shard is stored.
+    /// - The run is limited to shard 1 of 1: returns 1.
+    /// - The run is limited to one of several shards: the run ends here, as intended, with the error
+    ///   [`Error::ShardDone`], which reports the missing shards. Before that, `make` computes and stores the shard of
+    ///   this run if `find`, which reads a stored shard, does not find it.
     fn divide<T>(
         &self,
         stage: &str,

@@ -139,7 +139,9 @@ impl ValueType {
 /// `i` is value number `offset + Σ i·stride` of the storage. All strides and offsets count values.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TensorView {
-    /// Node of the object tree that builds the tensor. For a parameter, the node of the tensor inside it.
+    /// Index of the node of this tensor in the object tree of the pickle, which has one node per Python value. The node
+    /// is the function call that builds the tensor. For a PyTorch `Parameter`, it is the node of the tensor that it
+    /// wraps.
     pub(crate) id: NodeId,
     /// Key of the storage (block of tensor values) that holds the values of this tensor.
     pub(crate) storage: String,

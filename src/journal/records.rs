@@ -111,8 +111,8 @@ pub struct FieldSummary {
     /// Mean PSNR of renders with the exact deformation field, compared with renders of the original, dB; `None` if it
     /// was not measured, because `rounding` is so high (60 dB or more) that half precision is used in any case.
     pub result: Option<f64>,
-    /// Minimum PSNR, dB, between renders with the half-precision and with the exact deformation field (`rounding`) for
-    /// which half precision is used.
+    /// Minimum PSNR, dB, that `rounding` must reach; the deformation field is then written in half precision.
+    /// `rounding` is the PSNR of renders with the half-precision field, compared with renders with the exact field.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }

@@ -98,8 +98,9 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
 /// leader).
 struct Predecessors {
     start: Vec<usize>,
-    /// Pairs (possible leader, node), where the leader is the node that the other may join. Sorted by node, then by the
-    /// rank of the possible leader.
+    /// Pairs (possible leader, node). A node is a Gaussian or a merged group. It may join the possible leader, a node
+    /// of lower rank. The rank of a node is its position in the order in which the greedy rule visits the nodes. The
+    /// pairs are sorted by the index of the node; pairs of the same node are sorted by the rank of the possible leader.
     pairs: Vec<(u32, u32)>,
 }
 

@@ -123,11 +123,13 @@ impl<const S: usize> ViewStates<'_, S> {
         self.decoded[subject].map(|(_, features)| features)
     }
 
-    /// Renders the Gaussians `state` with the camera of this view, in place of the Gaussians of the subject with index
-    /// `subject`. Works like [`ViewStates::render`] otherwise.
+    /// Renders the Gaussians `state` with the camera of this view over `background` and returns the image. A view has
+    /// one or more subjects (sources of Gaussians to render), such as the original and the compressed model. `state`
+    /// takes the place of the Gaussians of the subject with index `subject`.
     ///
-    /// `features` replaces the features of the subject and must have one row per Gaussian of `state`. If it is `None`,
-    /// the Gaussians are rendered with their own colors.
+    /// `features` takes the place of the features of this subject and must have one row per Gaussian of `state`. The
+    /// decoder of the subject's model computes the pixel colors from them, and `background` is ignored. If `features`
+    /// is `None` or the subject has no features, the Gaussians are rendered with their own colors.
     pub fn render_as(
         &self,
         subject: usize,

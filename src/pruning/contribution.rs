@@ -108,7 +108,8 @@ impl RunningContribution {
         )
     }
 
-    /// Returns the contributions C and the peaks W over all views added so far.
+    /// Returns two values of every Gaussian over all views added so far: its contribution C (Σ alpha · transmittance
+    /// over the pixels of a view, averaged over the views) and its peak W (largest alpha · transmittance in one pixel).
     pub fn finish(self) -> VisibleContribution {
         let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
         VisibleContribution::new(&self.sum(), pictures, pixel_stride)

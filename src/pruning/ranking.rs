@@ -1,6 +1,10 @@
-//! Ranking of all Gaussians in which the selected ones come first. For any target count n, the first n Gaussians of the
-//! ranking are kept. They are the same as if both stages of the selection (number of candidates in stage 1, thresholds
-//! in stage 2) were made stricter or looser together until n Gaussians passed.
+//! Ranking of all Gaussians, best first. To keep n Gaussians, the first n of the ranking are taken.
+//!
+//! The ranking extends the selection of a recipe, which has two stages, to any number n. Stage 1 keeps the k₁ Gaussians
+//! with the highest scores. Stage 2 keeps the k₂ Gaussians whose static or dynamic score reaches a threshold. A
+//! Gaussian is selected if it passes both stages. For another number n, both stages are made stricter or looser by a
+//! common factor λ: stage 1 keeps λ·k₁ Gaussians, and the thresholds are moved so that stage 2 keeps λ·k₂. The first n
+//! Gaussians of the ranking are those that pass both stages with the λ for which n Gaussians pass.
 
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};

@@ -260,9 +260,9 @@ impl<'a> RefineRun<'a> {
         OptimizerState::new(self.scene, result, self.targets, self.refine.step_params(), fixed)
     }
 
-    /// Returns the cache key of a refined model that is made from `reduction` by removing Gaussians until `size` are
-    /// left. The number of optimization steps also depends on `wanted`, the number of Gaussians after the last prune
-    /// step, so `wanted` is part of the key.
+    /// Returns the cache key of a refined model that is made from `reduction`. `size`: number of Gaussians of this
+    /// model, which later prune steps may reduce further. `wanted`: number of Gaussians after the last of these prune
+    /// steps, at most `size`. The number of optimization steps depends on `wanted`, so it is part of the key.
     fn key(&self, reduction: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
         self.key.extended_by(&(reduction, size, wanted, self.sampler.taken))
     }

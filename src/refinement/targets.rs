@@ -68,9 +68,12 @@ pub(crate) struct Targets {
     values: Vec<(Range<usize>, Spill)>,
 }
 
-/// Fraction of the views from new cameras that are rendered from cameras outside the rig if [`Scene::outside`] is 1.
-/// For a smaller [`Scene::outside`], the fraction is smaller in proportion. A camera is outside the rig if it sees the
-/// scene from a direction that no camera of the scene, and no path between two of them, has.
+/// Fraction of the new cameras of target views (renders that refinement fits) that are placed outside the rig, if
+/// [`Scene::outside`] is 1. The other new cameras are placed between two cameras of the scene. A camera is outside the
+/// rig if it sees the scene from a new direction, one that does not lie between the directions of the scene's cameras.
+///
+/// [`Scene::outside`] is the weight, from 0 to 1, of the quality of renders from such new directions. The fraction of
+/// cameras is in proportion to it.
 const OUTSIDE_SHARE: f64 = 0.5;
 
 /// Purpose of a target view.

@@ -37,7 +37,9 @@ pub const CROP_SIDE_PX: u32 = 64;
 /// Gaussian (fast, thin or changing in appearance).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewErrorSums {
-    /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`].
+    /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`]: fast, thin, changing in appearance.
+    /// The squared error of a pixel is added to the sums of each kind in proportion to the kind's share in the pixel, Σ
+    /// alpha · transmittance of its Gaussians.
     kinds: [FailureSums; 3],
     /// Sum over pixels of e²: the squared difference between the renders of the two models, averaged over color
     /// channels.

@@ -88,7 +88,9 @@ impl RigCone {
         self.angle_outside(camera) >= MIN_ANGLE
     }
 
-    /// Returns the angle in radians between the unit vector `direction` and the cone.
+    /// Returns the angle in radians between the unit vector `direction` and this cone; 0 if `direction` is inside. The
+    /// cone consists of all sums Σ wᵢ·dᵢ with weights wᵢ ≥ 0, where the unit vectors dᵢ are the directions from the
+    /// focus to the cameras of the rig.
     ///
     /// The nearest point of the cone is Σ wᵢ·dᵢ for the weights wᵢ ≥ 0 that minimize ‖direction − Σ wᵢ·dᵢ‖, found by
     /// the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974, chapter 23). At most three

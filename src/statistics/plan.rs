@@ -87,10 +87,13 @@ impl ScanPlan {
         })
     }
 
-    /// Creates the plan with which the scan of a stream begins, before its frames have arrived. `cameras` lists all
-    /// cameras that may see the frames. The plan assumes that the frames are evenly spaced. If they are, the scan can
-    /// be finished with the plan that [`ScanPlan::new`] creates for the complete sequence (see
-    /// [`ScanPlan::fits_scan_begun_with`]).
+    /// Creates the plan (parameters) with which the scan of a stream begins. The scan is the pass over all frames that
+    /// computes the statistics of the Gaussians. It begins before the frames have arrived, so their number and time
+    /// stamps are unknown; the plan assumes evenly spaced frames. `cameras` lists all cameras that may see the frames.
+    ///
+    /// After the last frame, [`ScanPlan::new`] creates a second plan, for the complete sequence, with which the scan is
+    /// finished. This is possible if the frames are in fact evenly spaced; [`ScanPlan::fits_scan_begun_with`] returns
+    /// whether it is.
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {

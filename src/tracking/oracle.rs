@@ -369,16 +369,19 @@ pub(super) fn slow_joined_tracks(
     joined
 }
 
-/// Joins tracks (Gaussians followed through frames) that seem to be one Gaussian. Each of `pairs` has an earlier track,
-/// a later track that may continue it, a cost (distance and difference in appearance), and whether the earlier track
-/// has ended (see [`TrackPairs`]). Repeats these steps:
-/// 1. For each later track, select its pair of lowest cost.
-/// 2. Ignore, in this repetition, selected pairs whose earlier track has not ended.
-/// 3. Go through the other selected pairs by increasing cost. Join the two tracks of a pair, unless the earlier track
+/// Joins tracks (Gaussians followed through frames) that seem to be one Gaussian. Each of `pairs` is a possible join of
+/// a later track to an earlier track. It has a cost (distance and difference in appearance) and states whether the
+/// earlier track has ended (see [`TrackPairs`]).
+///
+/// Works in rounds. Each round has three steps:
+/// 1. Select the pair of lowest cost of each later track. If the earlier track of this pair has not ended, the later
+///    track is not joined in this round, and this pair remains in `pairs`.
+/// 2. Go through the other selected pairs by increasing cost. Join the two tracks of a pair, unless the earlier track
 ///    is already continued by another track.
-/// 4. Remove from `pairs` every pair whose later track is joined.
-/// 5. Remove from `pairs` every pair whose earlier track has ended and is already continued.
-/// 6. Stop if step 2 left no selected pair.
+/// 3. Remove all pairs of later tracks that are joined, and all pairs of earlier tracks that have ended and are already
+///    continued. A later track that loses its selected pair in this way selects another one in the next round.
+///
+/// Stops after a round in which step 1 selects no pair whose earlier track has ended.
 ///
 /// The joins are recorded in two lists with one entry per track:
 /// - `predecessor`: number of the earlier track that the track continues, or `None`.

@@ -76,9 +76,15 @@ impl OpenTrack {
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
     }
 
-    /// Returns the cost of linking the track to a Gaussian with the appearance `appearance`: the squared distance from
-    /// the expected position plus the difference in appearance, both scaled by `round`. A link is possible only if the
-    /// cost is at most 1. If the term for the distance alone exceeds 1, returns only this term.
+    /// Returns the cost of linking the track (Gaussian followed through frames) to a Gaussian of the next frame, which
+    /// has the appearance `appearance`: (d/(r·u))² + s·Δ.
+    /// - d: distance of the Gaussian from the expected position of the track, scene units;
+    /// - u: length unit of the track ([`OpenTrack::distance_unit`]), scene units;
+    /// - Δ: difference in appearance;
+    /// - r and s: `round.reach` and `round.strictness`. Frames are linked in several rounds, with different values of
+    ///   these.
+    ///
+    /// A link is possible only if the cost is at most 1. If the first term exceeds 1, returns only this term.
     pub(super) fn cost(&self, appearance: &ComparedAppearance, round: &Round) -> f32 {
         self.cost_at(appearance, self.expected_position(), round.reach * self.distance_unit(), round.strictness)
     }

@@ -74,16 +74,17 @@ pub struct EncodedPositions {
 /// [`Network::motion`] computes them.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
-    /// Offset of the position: 3 planes (x, y, z of all Gaussians), scene units. If the network predicts screw motions:
-    /// 6 planes, 3 for the rotation part w and then 3 for the translation part v of the screw.
+    /// Offset that is added to the position: 3 planes (x, y, z of all Gaussians), scene units. If the network predicts
+    /// screw motions: 6 planes, 3 for the rotation part w and then 3 for the translation part v of the screw.
     pub warp: AttributeValues,
-    /// Offset of the quaternion: 4 planes in the order w, x, y, z.
+    /// Offset that is added to the quaternion: 4 planes (w, x, y, z of all Gaussians).
     pub rotation: AttributeValues,
-    /// Offset of the scales: 3 planes, scene units.
+    /// Offset that is added to the scales (not to their logarithms): 3 planes (x, y, z of all Gaussians), scene units.
     pub scaling: AttributeValues,
-    /// Offset of the opacity: 1 plane.
+    /// Offset that is added to the opacity (not to its logit): 1 plane, with one value per Gaussian.
     pub opacity: AttributeValues,
-    /// Offset of the SH coefficients of degree 0 (the color): 3 planes.
+    /// Offset that is added to the SH coefficients of degree 0 (the color): 3 planes (red, green, blue of all
+    /// Gaussians).
     pub color: AttributeValues,
 }
 

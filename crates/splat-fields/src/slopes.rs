@@ -87,8 +87,11 @@ struct TimeLineSegment<'a> {
 }
 
 impl TimeLineSegment<'_> {
-    /// Returns two lists of [`CHANNEL_CHUNK`] channels, from channel `first` on: the linearly interpolated values, and
-    /// their derivatives with respect to the normalized coordinate.
+    /// Interpolates the features linearly between the two texels (grid points), at the position of a Gaussian. Returns
+    /// two lists with [`CHANNEL_CHUNK`] channels each, from channel `first` on:
+    /// - the interpolated features;
+    /// - their derivatives with respect to the position along the spatial axis of the line, in normalized coordinates
+    ///   (−1 to 1 inside the box that the feature planes cover).
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 2] {
         let [low, high] = [channel_chunk(self.ends[0], first), channel_chunk(self.ends[1], first)];

@@ -108,7 +108,8 @@ pub(super) struct Fragment<V: Lanes> {
 pub(super) trait BlendSink {
     /// Values that are summed up for one splat over the pixels of the tile.
     type Accumulator<V: Lanes>: Copy;
-    /// Returns the initial values that are summed up for `splat`, before any pixel is added.
+    /// Returns the accumulator of `splat` as it is before any pixel of the tile is added. Its sums and maxima are 0. It
+    /// may also hold constants of the splat that [`BlendSink::add`] needs, such as the color.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
     /// Adds the values `fragment` of a splat in some pixels to `accumulator`, the sums of this splat so far, and
     /// returns the new sums. The pixels are those of group `group` of the tile; a group is [`LANES`] neighboring pixels

@@ -130,7 +130,8 @@ pub(super) struct Splat {
 }
 
 impl Splat {
-    /// Value of [`Splat::drawn_tiles`] of a splat without excluded pixels.
+    /// Value of [`Splat::drawn_tiles`] of a splat that may be drawn in every tile. With any other value, the splat is
+    /// not drawn in pixels outside the tiles in which the original CUDA rasterizer draws it.
     pub(super) const UNBOUNDED: [u16; 4] = [0, u16::MAX, 0, u16::MAX];
 }
 

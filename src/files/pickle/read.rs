@@ -308,8 +308,9 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the stack index of the lowest of the top `count` values, which an instruction adds to the container
-    /// directly below them on the stack. Fails if there is nothing below them in the innermost open container.
+    /// Returns the stack index of the lowest of the `count` values on top of the stack. Used by instructions that add
+    /// these values to a list or dict, which must lie directly below them on the stack. Fails if fewer than `count` + 1
+    /// values were pushed since the innermost open container was begun.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }

@@ -82,7 +82,9 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) line: &'a LinearPath,
     /// Time stamp of the frame.
     pub(in crate::models) time: f64,
-    /// Weight of the frame: value of the proxy's temporal window, times opacity of the target state of the proxy.
+    /// Weight of this frame in a weighted fit of the proxy's attributes, such as the SH coefficients, over the frames.
+    /// It is a product: the proxy's temporal window at this frame (factor of its opacity that depends on time, 1 at the
+    /// center of the window), times the opacity of the target state.
     pub(in crate::models) weight: f64,
     /// Target states of a block of proxies (Gaussians that replace merged ones) at this frame, one row per proxy. Each
     /// has the mean and covariance of the mixture of the Gaussians that its proxy replaces.
