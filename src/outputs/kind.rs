@@ -137,7 +137,10 @@ impl OutputKind {
     pub fn check_frames(self, frames: usize, path: &Path) -> Result<()> {
         let too_many = |ending: &str, others: &str| {
             let path = path.shown();
-            Err(Error::usage(format!("{path}: {frames} frames do not fit one .{ending}\n  write {others}")))
+            Err(Error::usage(format!(
+                "{path}: {frames} frames do not fit one .{ending}\n  write {others}; for a single frame, give --frames 1 \
+                 with a model, or convert a PLY of --as ply-sequence"
+            )))
         };
         match self {
             _ if frames == 1 => Ok(()),
