@@ -7,8 +7,8 @@
 
 Rows of kind `stage` add one stage after the other, from pruning by the paper's score to `default`, then take single
 parts of `default` away. Rows of kind `setting` change one parameter of `default`, and the first of them none; they are
-measured at 10% only, and `robustness.py` compares `default` with the best of them for each model. PSNR is the mean over
-test views.
+measured at 10% only, and `robustness.py` compares `default` with the best of them for each model. With `--kinds` the
+file has the named rows only; `--results` writes it into another folder. PSNR is the mean over test views.
 """
 
 import tempfile
@@ -22,7 +22,6 @@ SETTINGS = {
     "default": [],
     "contrast_floor=0": ["contrast_floor=0"],
     "contrast_floor=0.3": ["contrast_floor=0.3"],
-    "round_pictures=48, round_turns=4": ["round_pictures=48", "round_turns=4"],
     "round_fraction=0.8": ["round_fraction=0.8"],
     "round_fraction=0.95": ["round_fraction=0.95"],
     "refine_cut_steps=120": ["refine_cut_steps=120"],
@@ -51,6 +50,7 @@ def stages(kept):
         "default, colors refined only": sets("refine=color"),
         "default, exact field": sets("field=exact"),
         "default, every SH degree": sets("bands=all"),
+        "default, rounds of 48 views": sets("round_pictures=48", "round_turns=4"),
     }
 
 

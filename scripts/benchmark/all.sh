@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Measures every table of docs/benchmarks.md, draws its plots, and writes the tables into README.md and the page.
-# Usage: scripts/benchmark/all.sh DATA. DATA is the folder with the trained models. Takes about two hours on two cores.
+# Usage: scripts/benchmark/all.sh DATA. DATA is the folder with the trained models. Takes about six hours on two cores, of which
+# the ablation takes four.
 #
 # Programs of others take part if these variables name them:
 #   SPLAT_TRANSFORM  command that runs @playcanvas/splat-transform
@@ -24,6 +25,8 @@ measure player_formats --models spinach_4,deform2 ${FOURDGS_PYTHON:+--fourdgs "$
 measure sequences ${SPLAT4D:+--splat4d "$SPLAT4D"} ${FOURDGS_PYTHON:+--fourdgs "$FOURDGS_PYTHON"}
 measure ablation
 measure robustness
+measure keyframes --models deform2,room2_dynerf
+measure outside
 measure large_scene --models room2_dynerf
 measure scale
 measure format_speed

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compares `default` with the best single change of a parameter per model: docs/benchmarks/robustness.csv.
+"""Compares `default` with the best of some other settings per model: docs/benchmarks/robustness.csv.
 
     python3 scripts/benchmark/robustness.py target/release/splatsieve DATA
 

@@ -36,8 +36,8 @@ const HEADER_BYTES_4: usize = 32;
 /// gzip compression level of `.spz` files of version 3. On trained models higher levels save less than 0.1% of the
 /// bytes, and on repetitive ones they take up to ten times as long.
 const GZIP_LEVEL: u32 = 4;
-/// zstd compression level of `.spz` files of version 4. With level 12, files of trained models change in size by −0.3%
-/// to +1%.
+/// zstd compression level of `.spz` files of version 4. Level 12 would make files of trained models between 0.3% smaller
+/// and 1% larger.
 const ZSTD_LEVEL: i32 = 3;
 /// Largest magnitude of a coordinate as it is stored: a 24-bit signed integer, in units of 2^−(fractional bits) scene
 /// units.

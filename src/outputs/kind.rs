@@ -138,8 +138,9 @@ impl OutputKind {
         let too_many = |ending: &str, others: &str| {
             let path = path.shown();
             Err(Error::usage(format!(
-                "{path}: {frames} frames do not fit one .{ending}\n  write {others}; for a single frame, give --frames 1 \
-                 with a model, or convert a PLY of --as ply-sequence"
+                "{path}: {frames} frames do not fit one .{ending}\n  write {others}\n  \
+                 for one frame of a model: convert with --frames 1; of frames: write them with --as ply-sequence, and \
+                 convert one of the files"
             )))
         };
         match self {

@@ -211,6 +211,8 @@ impl RefineStage {
         let is_deformed = work.input.jacobian > 0;
         let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
         let left_readers = if is_deformed { [("readers", 0), ("held", 0)] } else { read };
+        // Optimization steps use one renderer, and the ranking of a prune step one per thread.
+        let view_bytes = (2 * GRADIENT_BYTES_PER_VISIBLE as u64).max(work.threads * SHARED_VIEW_BYTES_PER_GAUSSIAN);
         let left = [
             ("states", states * whole),
             ("jacobians", (2 + work.threads.max(2)) * work.input.jacobian),
@@ -218,7 +220,7 @@ impl RefineStage {
             ("neighbors", NEIGHBOR_BYTES),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
             ("result", work.input.reduced),
-            ("views", (2 * GRADIENT_BYTES_PER_VISIBLE as u64).max(work.input.prepared)),
+            ("views", view_bytes.max(work.input.prepared)),
         ];
         // Peak memory is the maximum of three phases: rendering the original, optimizing constant deltas of the
         // survivors (Gaussians left by pruning), and optimizing deltas that vary with time.

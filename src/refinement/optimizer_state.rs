@@ -11,7 +11,7 @@ use super::loss::{Loss, RenderQuality};
 use super::targets::Targets;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::{Error, Result};
-use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, SequenceInfo, StoredParams};
+use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::FrameStates;
 use crate::refinement::optimizer::{Adam, RateSchedule};
 use crate::render::{RemovalError, Renderer};
@@ -241,13 +241,12 @@ impl<'a> OptimizerState<'a> {
     pub(super) fn reevaluate_states(&mut self) -> Result<()> {
         let Some(deformation) = self.deformation else { return Ok(()) };
         self.bake_delta();
-        // Frees the renderer's buffers. The memory plan counts them or what the field computes without time, not both.
-        self.renderer = Renderer::on_all_threads();
+        self.free_buffers();
         let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
         let gaussians = deformation.with_params(&self.stored);
         for &frame in &self.frames {
             let want = if linearized.is_empty() { Attributes::all() } else { self.varying };
-            self.now.present = None;
+            (self.now.present, self.now.jacobian) = (None, Jacobian::default());
             gaussians.state(frame, want, &mut self.now.state)?;
             self.now.jacobian = gaussians.jacobian(frame, self.step_params.columns)?;
             linearized.push(&mut self.now)?;
@@ -256,6 +255,12 @@ impl<'a> OptimizerState<'a> {
         self.linearized = linearized.finish()?;
         (self.steps, self.reevaluated) = (0, true);
         Ok(())
+    }
+
+    /// Frees the buffers of the renderer that the optimization steps use. The memory plan counts either them, or what a
+    /// deformation field computes without time, or the renderers of [`OptimizerState::removal_error`].
+    fn free_buffers(&mut self) {
+        self.renderer = Renderer::on_all_threads();
     }
 
     /// Returns the state of the optimizer for a checkpoint, from which [`OptimizerState::resume`] continues.
@@ -454,14 +459,17 @@ impl<'a> OptimizerState<'a> {
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
-    pub(super) fn removal_error(&self, views: &[usize], contrast_floor: f32) -> Result<RemovalError> {
-        let zero = || (self.new_worker(), RemovalError::new(self.fixed.len(), contrast_floor));
+    pub(super) fn removal_error(&mut self, views: &[usize], contrast_floor: f32) -> Result<RemovalError> {
+        self.free_buffers();
+        let optimizer = &*self;
+        let zero = || (optimizer.new_worker(), RemovalError::new(optimizer.fixed.len(), contrast_floor));
         let add_view = |((mut renderer, mut now), mut errors): ((Renderer, LinearizedState), RemovalError),
                         &k: &usize| {
-            self.show(self.frame_index(k), &mut now)?;
+            optimizer.show(optimizer.frame_index(k), &mut now)?;
             let mut sparse = now.present.as_ref().map(|present| RemovalError::new(present.len(), contrast_floor));
             let found = sparse.as_mut().unwrap_or(&mut errors);
-            renderer.removal_error(&now.state, self.targets.view(k, self.stride), self.scene.background, found);
+            let view = optimizer.targets.view(k, optimizer.stride);
+            renderer.removal_error(&now.state, view, optimizer.scene.background, found);
             if let Some((present, found)) = now.present.as_ref().zip(sparse) {
                 errors.merge_rows(present, &found);
             }
