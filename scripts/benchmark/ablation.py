@@ -22,6 +22,7 @@ SETTINGS = {
     "default": [],
     "contrast_floor=0": ["contrast_floor=0"],
     "contrast_floor=0.3": ["contrast_floor=0.3"],
+    "round_pictures=48, round_turns=4": ["round_pictures=48", "round_turns=4"],
     "round_fraction=0.8": ["round_fraction=0.8"],
     "round_fraction=0.95": ["round_fraction=0.95"],
     "refine_cut_steps=120": ["refine_cut_steps=120"],

@@ -118,11 +118,14 @@ pub fn write_spz(state: &Gaussians, version: SpzVersion, path: &Path) -> Result<
 /// compressed together by gzip. `unit` is the unit in which positions are stored, in scene units.
 fn write_gzip(head: &[u8], state: &Gaussians, unit: f64, file: impl Write) -> std::io::Result<()> {
     // Write no time stamp and no name into the gzip header, so that the same scene gives the same bytes.
-    let mut out = GzBuilder::new().write(file, Compression::new(GZIP_LEVEL));
+    let compressed = GzBuilder::new().write(file, Compression::new(GZIP_LEVEL));
+    // The arrays are written in pieces of a few bytes, and each call of the compressor takes time.
+    let mut out = BufWriter::with_capacity(1 << 16, compressed);
     out.write_all(head)?;
     ARRAYS.iter().try_for_each(|write| write(state, unit, &mut out))?;
-    out.try_finish()?;
-    out.get_mut().flush()
+    let mut compressed = out.into_inner().map_err(std::io::IntoInnerError::into_error)?;
+    compressed.try_finish()?;
+    compressed.get_mut().flush()
 }
 
 /// Writes an `.spz` file of version 4 to `file`: the header, the table of sizes, and each array of the Gaussians
@@ -247,9 +250,11 @@ fn scale_byte(log_scale: f32) -> u8 {
 /// Returns the byte that stores the SH coefficient `value` above degree 0. `k` is its index among the coefficients of
 /// one color channel, from 1. The number 128·`value` + 128 is rounded to 5 bits in degree 1 and to 4 bits above.
 fn sh_byte(k: usize, value: f32) -> u8 {
-    let step = if k < 4 { 8.0 } else { 16.0 };
-    let nearest = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
-    byte(nearest.floor() * step)
+    let step = if k < 4 { 8 } else { 16 };
+    let scaled = 128.0 * f64::from(value);
+    // The nearest integer; halves are rounded away from 0. Larger magnitudes than ±512 do not fit a byte anyway.
+    let rounded = (scaled + 0.5f64.copysign(scaled)).clamp(-512.0, 512.0) as i32;
+    ((rounded + 128 + step / 2).div_euclid(step) * step).clamp(0, 255) as u8
 }
 
 /// Encodes a unit quaternion xyzw in 32 bits: the index of the component with the largest magnitude, and the values of
@@ -326,6 +331,18 @@ mod tests {
                 )
             })
             .collect()
+    }
+
+    #[test]
+    fn sh_bytes_are_multiples_of_the_step_nearest_to_the_value() {
+        for (k, step) in [(1, 8.0), (3, 8.0), (4, 16.0), (15, 16.0)] {
+            for value in (-40_000..40_000).map(|i| i as f32 / 15_000.0).chain([f32::MAX, f32::MIN, 1e-20, -0.5 / 128.0])
+            {
+                let steps = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
+                let expected = (steps.floor() * step).clamp(0.0, 255.0) as u8;
+                assert_eq!(super::sh_byte(k, value), expected, "coefficient {k}, value {value}");
+            }
+        }
     }
 
     #[test]
