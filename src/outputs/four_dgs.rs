@@ -66,12 +66,17 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     ))
 }
 
-/// Rounds positions, velocities, colors and opacities in `set` to the quantization grid of the file, so that the
+/// Rounds positions, scales, velocities, colors and opacities in `set` to the quantization grid of the file, so that the
 /// encoder accepts them. The encoder checks that each decoded value differs from the given one by at most half a
 /// quantization step. This check fails for some values midway between two grid points, because decoded values are
-/// rounded to f32. Coordinates of a few scene units may lie midway between two grid points, and odd 8-bit colors always
-/// do.
+/// rounded to f32. Coordinates of a few scene units may lie midway between two grid points, odd 8-bit colors always do,
+/// and of 100,000 scales one or so does.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
+    // The grid of logarithms of scales does not depend on the scene. That of positions follows from the median scale.
+    let log_step = Steps::of(&Bounds::for_profile(options.profile, 1.0)).scale_log;
+    for scale in set.scales.iter_mut().filter(|scale| **scale > 0.0) {
+        *scale = ((f64::from(*scale).ln() / log_step).round() * log_step).exp() as f32;
+    }
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {
         return;
@@ -151,12 +156,13 @@ mod tests {
     use crate::model::{Attributes, opacity};
     use crate::passes::gather_all;
 
-    #[test]
-    fn colors_of_eight_bits_are_written() {
+    /// Returns 256 Gaussians that do not move, with every 8-bit color, and with the three scales `scale(k)` of
+    /// Gaussian k.
+    fn still_set(scale: impl Fn(usize) -> f32) -> GaussianSet {
         let byte = |k: usize| k as f32 / 255.0;
-        let mut set = GaussianSet {
+        GaussianSet {
             positions: (0..256).flat_map(|k| [k as f32, 0.0, 0.0]).collect(),
-            scales: vec![0.1; 3 * 256],
+            scales: (0..256).flat_map(|k| [scale(k); 3]).collect(),
             rotations: [0.0, 0.0, 0.0, 1.0].repeat(256),
             colors: (0..256).flat_map(|k| [byte(k), byte(255 - k), byte(k), byte(k)]).collect(),
             motions: vec![0.0; 3 * 256],
@@ -165,7 +171,25 @@ mod tests {
             win_lo: vec![0.0; 256],
             win_hi: vec![1.0; 256],
             ..GaussianSet::default()
-        };
+        }
+    }
+
+    #[test]
+    fn scales_midway_between_grid_points_are_written() {
+        let options = WriteOptions::default();
+        let log_step = Steps::of(&Bounds::for_profile(options.profile, 1.0)).scale_log;
+        let mut set = still_set(|k| ((k as f64 - 200.5) * log_step).exp() as f32);
+        let exact = set.scales.clone();
+        snap_to_grid(&mut set, &options);
+        write_to_vec(&set, 1.0, &options, &SceneExtras::default()).unwrap();
+        let ratios = set.scales.iter().zip(&exact).map(|(a, b)| f64::from(a / b).ln().abs());
+        let largest = ratios.fold(0.0, f64::max);
+        assert!(largest <= 0.501 * log_step, "logarithms of scales differ by {largest}");
+    }
+
+    #[test]
+    fn colors_of_eight_bits_are_written() {
+        let mut set = still_set(|_| 0.1);
         let (exact, options) = (set.colors.clone(), WriteOptions::default());
         snap_to_grid(&mut set, &options);
         write_to_vec(&set, 1.0, &options, &SceneExtras::default()).unwrap();
