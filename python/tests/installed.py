@@ -67,6 +67,8 @@ class Installed(unittest.TestCase):
         )
         written = json.loads((self.at / "half.gseq.summary.json").read_text())
         self.assertIn("half.gseq", written.pop("files"))
+        # The file names input and output without their folders.
+        summary["output"], summary["input"]["path"] = "half.gseq", "scene.gseq"
         self.assertEqual(summary, written)
         self.assertTrue(any("scan" in line for line in lines), lines)
         before, after = (splatsieve.info(self.at / name)["gaussians"] for name in ("demo/scene.gseq", "half.gseq"))
@@ -109,7 +111,7 @@ class Installed(unittest.TestCase):
 
     def test_a_compressed_stream_has_a_summary(self):
         columns = self.columns(200)
-        with splatsieve.stream(self.at / "c.gseq", 200, 0, columns, target_count=50, no_refine=True) as out:
+        with splatsieve.stream(self.at / "c.gseq", 200, 0, columns, count_=50, no_refine=True) as out:
             out.frame(0.0, {})
             out.frame(1.0, {})
         self.assertEqual(splatsieve.info(self.at / "c.gseq")["gaussians"], 50)
@@ -133,7 +135,8 @@ class Installed(unittest.TestCase):
         def help(*words):
             return subprocess.run([splatsieve.program(), *words, "--help"], check=True, capture_output=True, text=True).stdout
 
-        verbs = re.findall(r"^  (\w+) ", help().partition("Commands:")[2].partition("Options:")[0], re.M)
+        # A line of a command: its name after two blanks, then two blanks or more before its description.
+        verbs = re.findall(r"^  ([\w-]+) {2,}", help().partition("\nOptions:")[0], re.M)
         self.assertIn("compress", verbs)
         options = "".join(help(verb) for verb in verbs if verb != "help")
         # A name is followed by its value, or after two blanks by its description.
@@ -141,10 +144,14 @@ class Installed(unittest.TestCase):
         self.assertEqual({name.replace("-", "_") for name in found} - {"help", "version"}, set(_program.SWITCHES))
 
     def test_options_become_command_line_words(self):
-        words = _program.flags({"as_": "ply", "overwrite": False, "dry_run": True, "choose_by_views": False, "cameras": None})
-        self.assertEqual(words, ["--as=ply", "--dry-run", "--set choose_by_views=false"])
-        words = _program.flags({"keep_box": (-1, 0, 1.5), "max_error": {"position": 1e-3}, "merge_pass": [(1, 2), (3, 4)]})
-        self.assertEqual(words, ["--keep-box=-1,0,1.5", "--max-error=position=0.001", "--set passes=1,2", "--set passes=3,4"])
+        words = _program.flags({"as_": "ply", "overwrite": False, "dry_run": True, "cameras": None})
+        self.assertEqual(words, ["--as=ply", "--dry-run"])
+        words = _program.flags({"keep_box": (-1, 0, 1.5), "max_error": {"position": 1e-3}})
+        self.assertEqual(words, ["--keep-box=-1,0,1.5", "--max-error=position=0.001"])
+        words = _program.flags({"set": {"choose_by_views": False, "refine_steps": 9}})
+        self.assertEqual(words, ["--set=choose_by_views=false", "--set=refine_steps=9"])
+        words = _program.flags({"set": [("passes=1", 2), ("passes=3", 4)]})
+        self.assertEqual(words, ["--set=passes=1,2", "--set=passes=3,4"])
 
 
 if __name__ == "__main__":
