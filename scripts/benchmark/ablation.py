@@ -15,14 +15,15 @@ import tempfile
 from pathlib import Path
 
 from error_against_time import VISIBLE
-from measuring import KEPT, Results, arguments, chosen, compress, evaluate
+from measuring import KEPT, Results, arguments, chosen, compress, evaluate, words
 
 PRUNE = ["--no-refine", "--prune-only"]
+ROUNDS_OF_48_VIEWS = ["round_pictures=48", "round_turns=4"]
 SETTINGS = {
     "default": [],
     "contrast_floor=0": ["contrast_floor=0"],
     "contrast_floor=0.3": ["contrast_floor=0.3"],
-    "round_pictures=48, round_turns=4": ["round_pictures=48", "round_turns=4"],
+    "round_pictures=48, round_turns=4": ROUNDS_OF_48_VIEWS,
     "round_fraction=0.8": ["round_fraction=0.8"],
     "round_fraction=0.95": ["round_fraction=0.95"],
     "refine_cut_steps=120": ["refine_cut_steps=120"],
@@ -51,14 +52,13 @@ def stages(kept):
         "default, colors refined only": sets("refine=color"),
         "default, exact field": sets("field=exact"),
         "default, every SH degree": sets("bands=all"),
-        "default, rounds of 48 views": sets("round_pictures=48", "round_turns=4"),
+        "default, rounds of 48 views": sets(*ROUNDS_OF_48_VIEWS),
     }
 
 
 def main():
-    words = {"type": lambda text: text.split(",")}
-    kept = ("--kept", words | {"default": KEPT, "help": "fractions of the Gaussians to keep"})
-    kinds = ("--kinds", words | {"default": ["stage", "setting"], "help": "kinds of rows to measure"})
+    kept = ("--kept", {"type": words, "default": KEPT, "help": "fractions of the Gaussians to keep"})
+    kinds = ("--kinds", {"type": words, "default": ["stage", "setting"], "help": "kinds of rows to measure"})
     args = arguments(__doc__, kept, kinds)
     columns = ["model", "kept", "kind", "setting", "gaussians", "bytes", "psnr_db", "ssim"]
     results = Results("ablation", args.program, columns)

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Measures every table of docs/benchmarks.md, draws its plots, and writes the tables into README.md and the page.
-# Usage: scripts/benchmark/all.sh DATA. DATA is the folder with the trained models. Takes about six hours on two cores, of which
-# the ablation takes four.
+# Usage: scripts/benchmark/all.sh DATA. DATA is the folder with the trained models. Takes about six hours on two cores, of
+# which the ablation takes four.
 #
 # Programs of others take part if these variables name them:
 #   SPLAT_TRANSFORM  command that runs @playcanvas/splat-transform

@@ -13,11 +13,11 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from measuring import Results, arguments, chosen, compress, evaluate, run
+from measuring import Results, arguments, chosen, compress, evaluate, run, words
 
 
 def main():
-    kept = {"type": lambda text: text.split(","), "default": ["20%", "5%"], "help": "fractions of the Gaussians to keep"}
+    kept = {"type": words, "default": ["20%", "5%"], "help": "fractions of the Gaussians to keep"}
     args = arguments(__doc__, ("--kept", kept))
     columns = ["model", "kept", "keyframes", "bytes", "processor_s", "psnr_db", "ssim", "temporal"]
     results = Results("keyframes", args.program, columns)

@@ -161,6 +161,11 @@ def middle_and_range(values):
     return statistics.median(values), min(values), max(values)
 
 
+def words(text):
+    """Returns the words of a list with commas; the type of options that take such a list."""
+    return text.split(",")
+
+
 def arguments(description, *more):
     """Returns the parsed command line `PROGRAM DATA [--models A,B] …`; `more` are further options as pairs of a name and
     keywords of argparse."""
@@ -168,7 +173,7 @@ def arguments(description, *more):
     parser.add_argument("program", help="the program to measure, such as target/release/splatsieve")
     parser.add_argument("data", type=Path, help="folder with the trained models")
     parser.add_argument("--results", type=Path, help="folder of the CSV file [default: docs/benchmarks]")
-    parser.add_argument("--models", type=lambda text: text.split(","), help="names of models, separated by commas [default: all]")
+    parser.add_argument("--models", type=words, help="names of models, separated by commas [default: all]")
     for name, keywords in more:
         parser.add_argument(name, **keywords)
     args = parser.parse_args()

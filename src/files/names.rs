@@ -19,6 +19,13 @@ pub fn name_of(path: &Path) -> String {
     name(path).or_else(|| name(&fs::canonicalize(path).ok()?)).unwrap_or_else(|| path.to_string_lossy().into_owned())
 }
 
+/// Returns whether the file name of `path` has the ending `ending`, such as `.ply` or `.ftgs.ply`, in lower or upper
+/// case. A name that is nothing but the ending does not have it.
+pub fn has_ending(path: &Path, ending: &str) -> bool {
+    let name = path.file_name().unwrap_or_default().as_encoded_bytes();
+    name.len() > ending.len() && name[name.len() - ending.len()..].eq_ignore_ascii_case(ending.as_bytes())
+}
+
 /// Characters that separate the components of a path on any system.
 const SEPARATORS: [char; 2] = ['/', '\\'];
 

@@ -310,10 +310,7 @@ fn fit_motion(
         rotation: std::array::from_fn(|k| rotation[k].map(|value| value / unscaled(k))),
         log_scale: std::array::from_fn(|c| mean(&|frame| track.log_scale[frame][c])),
         opacity: 0.0,
-        sh: match track.sh.as_slice() {
-            [constant] => constant.clone(),
-            _ => (0..track.sh(0).len()).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
-        },
+        sh: track.mean_sh(mean),
     }
 }
 

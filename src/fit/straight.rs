@@ -94,10 +94,7 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
         rotation: if length > 1e-6 { rotation.map(|x| x / length) } else { track.rotation[frames.start] },
         log_scale: std::array::from_fn(|c| mean(&|frame| track.log_scale[frame][c])),
         opacity: mean(&|frame| track.opacity[frame]),
-        sh: match track.sh.as_slice() {
-            [constant] => constant.clone(),
-            _ => (0..track.sh(0).len()).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
-        },
+        sh: track.mean_sh(mean),
         frames,
     }
 }

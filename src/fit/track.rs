@@ -75,6 +75,15 @@ impl FittedTrack {
         &self.sh[frame.min(self.sh.len() - 1)]
     }
 
+    /// Returns the mean of every SH coefficient. `mean` returns the mean over frames of a value that is given as a
+    /// function of the frame. It is not called if the coefficients are the same in all frames.
+    pub fn mean_sh(&self, mean: impl Fn(&dyn Fn(usize) -> f64) -> f64) -> Vec<f32> {
+        match self.sh.as_slice() {
+            [constant] => constant.clone(),
+            _ => (0..self.sh(0).len()).map(|c| mean(&|frame| f64::from(self.sh(frame)[c])) as f32).collect(),
+        }
+    }
+
     /// Returns the middle one of the three scales at `frame`, scene units; at least 1e-12.
     pub fn middle_scale(&self, frame: usize) -> f64 {
         let mut scales = self.log_scale[frame];

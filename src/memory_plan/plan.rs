@@ -72,9 +72,9 @@ impl MemoryPlan {
         Self::closest(work, budget.limit(), estimates).excess_bytes() == 0
     }
 
-    /// Returns the plan with the fastest limits under which all stages of a run on the input `work` fit into `budget`
-    /// (bytes). If no limits suffice, returns the plan that takes the least memory. `estimates` returns the estimates
-    /// of all stages for given limits.
+    /// Returns the fastest plan for a run on the input `work` in which every stage fits into `budget` bytes. If there is
+    /// none, returns the plan that takes the least memory. `estimates` returns the estimates of all stages for given
+    /// limits.
     pub(crate) fn closest(
         work: Workload,
         budget: u64,

@@ -19,6 +19,7 @@ use crate::files::compressed_ply::{self, read_compressed_ply};
 use crate::files::digest::hash_file;
 use crate::files::glb;
 use crate::files::glb::read::read_glb;
+use crate::files::names::has_ending;
 use crate::files::ply::write::write_inria;
 use crate::files::ply_frames::{FrameFiles, PlyFrames};
 use crate::files::sog::read::read_sog;
@@ -111,12 +112,6 @@ fn format_of(found: &FoundInput) -> Option<&'static StillFormat> {
         })
     };
     FORMATS.iter().find(|format| (format.recognizes)(found) || holds_frames(format))
-}
-
-/// Returns whether the name of `path` ends in `ending`, in lower or upper case.
-fn has_ending(path: &Path, ending: &str) -> bool {
-    let name = path.file_name().unwrap_or_default().as_encoded_bytes();
-    name.len() > ending.len() && name[name.len() - ending.len()..].eq_ignore_ascii_case(ending.as_bytes())
 }
 
 /// Returns whether `path` is named like a frame of the format with the ending `ending`, and is not hidden.

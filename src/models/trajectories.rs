@@ -92,9 +92,9 @@ pub(super) fn write_trajectories(
 }
 
 /// Writes the compressed model `reduction` of `source`, which has proxies (Gaussians that replace merged ones), to
-/// `path` as a container. The members of a proxy (merged Gaussians) can be anywhere in the source. So one block of
-/// frames is written after another, and in it one range of output Gaussians after another. A range is computed from at
-/// most `max_gaussians` source Gaussians, which are kept in memory; a single block of Gaussians may need more.
+/// `path` as a container. Writes the frame blocks one after another, and each of them in ranges of output Gaussians,
+/// because the members of a proxy (merged Gaussians) can be anywhere in the source. A range is computed from at most
+/// `max_gaussians` source Gaussians, which are kept in memory; a single block of Gaussians may need more.
 fn write_merged(
     source: &dyn FrameSource,
     reduction: &CompressedModel,

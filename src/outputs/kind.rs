@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, ShowPath};
+use crate::files::names::has_ending;
 
 /// Kind of output: the file format, or the layout of the output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -86,10 +87,10 @@ impl OutputKind {
 
     fn from_name(path: &Path) -> Option<OutputKind> {
         // These endings have two parts, of which the second one alone means an ordinary PLY.
-        if ends_with(path, ".ftgs.ply") {
+        if has_ending(path, ".ftgs.ply") {
             return Some(OutputKind::Ftgs);
         }
-        if ends_with(path, ".compressed.ply") {
+        if has_ending(path, ".compressed.ply") {
             return None;
         }
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
@@ -187,19 +188,13 @@ pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
 /// - `path` is an existing folder, which may have any name.
 fn foreign_ending(path: &Path) -> Option<&str> {
     const WITH_DIGITS: [&str; 7] = ["mp4", "4dgs", "splat4d", "h5", "hdf5", "7z", "bz2"];
-    if ends_with(path, ".compressed.ply") && !path.is_dir() {
+    if has_ending(path, ".compressed.ply") && !path.is_dir() {
         return Some("compressed.ply");
     }
     let ending = path.extension()?.to_str()?;
     let only_letters = ending.chars().all(|c| c.is_ascii_alphabetic());
     let known = only_letters || WITH_DIGITS.iter().any(|known| ending.eq_ignore_ascii_case(known));
     Some(ending).filter(|ending| known && !ending.is_empty() && !path.is_dir())
-}
-
-/// Returns whether the file name `path` ends with `ending`, in upper or lower case. `ending` is in lower case.
-fn ends_with(path: &Path, ending: &str) -> bool {
-    let name = path.file_name().and_then(|name| name.to_str());
-    name.is_some_and(|name| name.to_ascii_lowercase().ends_with(ending))
 }
 
 #[cfg(test)]

@@ -461,15 +461,14 @@ impl<'a> OptimizerState<'a> {
     /// Fails if a scratch file cannot be read.
     pub(super) fn removal_error(&mut self, views: &[usize], contrast_floor: f32) -> Result<RemovalError> {
         self.free_buffers();
-        let optimizer = &*self;
-        let zero = || (optimizer.new_worker(), RemovalError::new(optimizer.fixed.len(), contrast_floor));
+        let zero = || (self.new_worker(), RemovalError::new(self.fixed.len(), contrast_floor));
         let add_view = |((mut renderer, mut now), mut errors): ((Renderer, LinearizedState), RemovalError),
                         &k: &usize| {
-            optimizer.show(optimizer.frame_index(k), &mut now)?;
+            self.show(self.frame_index(k), &mut now)?;
             let mut sparse = now.present.as_ref().map(|present| RemovalError::new(present.len(), contrast_floor));
             let found = sparse.as_mut().unwrap_or(&mut errors);
-            let view = optimizer.targets.view(k, optimizer.stride);
-            renderer.removal_error(&now.state, view, optimizer.scene.background, found);
+            let view = self.targets.view(k, self.stride);
+            renderer.removal_error(&now.state, view, self.scene.background, found);
             if let Some((present, found)) = now.present.as_ref().zip(sparse) {
                 errors.merge_rows(present, &found);
             }

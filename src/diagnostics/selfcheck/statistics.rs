@@ -117,8 +117,8 @@ pub(super) fn short_lives() -> CaseResult {
 
 /// Compares the variance V of nearly constant opacities with a computation in two passes in f64: first the mean, then
 /// the deviations from it. Opacities of 0.9 that differ by 1e-6 have rounding errors of 1e-16, so V has a relative
-/// error below 1e-9. Computed from moments about 0 instead, V would have only 2 correct digits. Returns the largest
-/// error, with the bound that it must not exceed.
+/// error below 1e-9. If V were computed as the mean square minus the squared mean, only 2 digits would be correct.
+/// Returns the largest error, with the bound that it must not exceed.
 pub(super) fn steady_opacity() -> CaseResult {
     CaseResult::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);

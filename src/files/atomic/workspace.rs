@@ -34,16 +34,16 @@ const LOCK: &str = "lock";
 /// Content of the lock file of a workspace (hidden folder in which an output is written). It marks the folder as
 /// created by this program.
 pub(super) const LOCK_LINE: &str = "workspace of a splatsieve run\n";
-/// Name, in a workspace (hidden folder), of the output file or folder that is being written there.
+/// Name, inside a workspace (hidden folder), of the output file or folder that is being written.
 pub(super) const CONTENT: &str = "content";
-/// Name, in a workspace (hidden folder), of an earlier output folder that is being replaced. Files in it that its
+/// Name, inside a workspace (hidden folder), of an earlier output folder that is being replaced. Files in it that its
 /// summary does not list are moved into the new output folder.
 pub(super) const REPLACED: &str = "replaced";
-/// Name, in a workspace (hidden folder), that a file or folder gets when it is no longer needed. It is deleted with the
-/// workspace.
+/// Name that a file or folder gets inside a workspace (hidden folder) when it is no longer needed. It is deleted with
+/// the workspace.
 pub(super) const DISCARDED: &str = "discarded";
-/// Name, in a workspace (hidden folder), of the journal: the list of files of one result that get their final names
-/// together.
+/// File name of the journal inside a workspace (hidden folder). The journal lists the files of one result, which get
+/// their final names together.
 pub(super) const JOURNAL: &str = "journal";
 /// Names of the entries of a workspace that must not be deleted with it: an earlier output folder, and a journal (list
 /// of files that get their final names together). The next run with the same output restores the earlier folder, or

@@ -199,9 +199,9 @@ impl<R: Read> CountingReader<R> {
         Ok(all)
     }
 
-    /// Returns the error for an illegal field of the header, or of the mark before a frame or at the end. The header or
-    /// mark begins at byte `start` of the stream. `frame` is the number of the frame that was expected at the mark;
-    /// `None` for the header.
+    /// Returns the error for the illegal field `illegal` of the header or of a mark. A mark stands before every frame
+    /// and at the end of the stream. The header or mark begins at byte `start` of the stream. `frame` is the number of
+    /// the frame that was expected at the mark; `None` for the header.
     fn error(&self, start: u64, frame: Option<u32>, illegal: IllegalField) -> Error {
         let IllegalField { offset, expected, found, hint } = illegal;
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)

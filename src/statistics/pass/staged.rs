@@ -23,7 +23,7 @@ use crate::model::StatisticRows;
 use crate::source::{BlockReader, Ids, Prefetch};
 
 /// Maximum number of units of work (a block of Gaussians at some frames) that wait to be decoded after their bytes have
-/// been fetched. Applies to each lane (a decoding thread and an accumulating thread).
+/// been fetched. Each lane (a decoding thread and an accumulating thread) has a queue of this length.
 const FETCHED: usize = 4;
 
 /// Unit of work: a block of Gaussians at the frames of one frame block (consecutive frames that the source stores
