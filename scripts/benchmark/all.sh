@@ -20,6 +20,7 @@ measure rasterizer
 measure equal_count
 measure authors_code
 measure photographs
+measure toward_photographs
 measure equal_bytes ${SPLAT_TRANSFORM:+--splat-transform "$SPLAT_TRANSFORM"}
 measure player_formats --models spinach_4,deform2 ${FOURDGS_PYTHON:+--fourdgs "$FOURDGS_PYTHON"}
 measure sequences ${SPLAT4D:+--splat4d "$SPLAT4D"} ${FOURDGS_PYTHON:+--fourdgs "$FOURDGS_PYTHON"}

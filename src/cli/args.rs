@@ -9,8 +9,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 pub(super) use self::shared::{
-    CacheArgs, CameraFile, Cameras, Earlier, Input, LinkArg, Memory, OutputKindArg, Rot4d, SplitArg, Trained,
-    ZeroRotationArg,
+    CacheArgs, CameraFile, Cameras, Earlier, FitTargetArg, Input, LinkArg, Memory, OutputKindArg, Rot4d, SplitArg,
+    Trained, ZeroRotationArg,
 };
 pub(super) use self::study::{PrecisionArgs, Sweep};
 use self::values::{parse_box, parse_bytes, parse_color, parse_decibels, parse_ratio};
@@ -177,6 +177,7 @@ pub(super) struct Compress {
 /// Target of the compression [default: remove Gaussians that views hardly show].
 #[derive(Debug, Args)]
 #[command(group(clap::ArgGroup::new("size_of_output")))]
+#[command(group(clap::ArgGroup::new("photograph_user").args(["max_loss", "toward"]).multiple(true)))]
 pub(super) struct OutputSize {
     /// Fraction of the Gaussians to keep, exactly: 0.1, 10% or 10x (a tenth)
     #[arg(long, help_heading = HOW_SMALL, value_name = "FRACTION", group = "size_of_output", value_parser = parse_ratio)]
@@ -195,12 +196,18 @@ pub(super) struct OutputSize {
     /// Smallest output that loses at most this much PSNR against the photographs of --ground-truth, such as 0.5dB
     #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels, requires = "ground_truth")]
     pub(super) max_loss: Option<f64>,
-    /// Folder with photographs of the test views, for --max-loss
+    /// Folder with photographs: of the test views for --max-loss, of the training views for --toward
     ///
-    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of them is not used in the search and gives the
-    /// reported value.
-    #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER", requires = "max_loss")]
+    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of those of the test views is not used in the search
+    /// and gives the reported value.
+    #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER", requires = "photograph_user")]
     pub(super) ground_truth: Option<PathBuf>,
+    /// Images to fit the Gaussians to: photographs needs --ground-truth [default: renders, those of the original]
+    ///
+    /// With photographs, a second fit follows the one to renders. It is kept if it raises the PSNR against photographs
+    /// of cameras that are held back from it. It takes about as long as the first one.
+    #[arg(long, help_heading = HOW_SMALL, value_name = "IMAGES", hide_short_help = true)]
+    pub(super) toward: Option<FitTargetArg>,
 }
 
 /// Gaussians that the user keeps or drops.

@@ -27,7 +27,7 @@ use splatsieve::memory_plan::{Budget, Verbosity};
 use splatsieve::model::Split;
 use splatsieve::models::{LinkMode, TrainingConventions, ZeroRotation};
 use splatsieve::outputs::kind::OutputKind;
-use splatsieve::pipeline::{PruneOrMerge, Request, RunOptions, Target};
+use splatsieve::pipeline::{FitTarget, PruneOrMerge, Request, RunOptions, Target};
 use splatsieve::player::view;
 use splatsieve::player::view::ViewOptions;
 use splatsieve::progress::Events;
@@ -85,23 +85,26 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
         }
         None => RunOptions::default(),
     };
-    let OutputSize { ratio, count, size, min_psnr, max_loss, ground_truth } = args.size;
+    let OutputSize { ratio, count, size, min_psnr, max_loss, ground_truth, toward } = args.size;
     let given = RunOptions {
         target_count: count,
         target_ratio: ratio,
         min_psnr,
         max_loss,
         target_size: size,
-        ground_truth,
         ..RunOptions::default()
     };
     // A target on the command line replaces the target of the recorded run.
     let is_open = given == RunOptions::default();
-    let target_options = if is_open { &run } else { &given };
-    if let (true, Some(photographs)) = (is_open, &run.ground_truth) {
-        args.recipe.check_recorded_path("ground-truth", photographs)?;
+    let toward = toward.map_or(run.toward, FitTarget::from);
+    let mut chosen = RunOptions { toward, ..if is_open { run.clone() } else { given } };
+    let needs_photographs = chosen.max_loss.is_some() || toward == FitTarget::Photographs;
+    chosen.ground_truth = ground_truth;
+    if let (true, None, Some(recorded)) = (needs_photographs, &chosen.ground_truth, &run.ground_truth) {
+        args.recipe.check_recorded_path("ground-truth", recorded)?;
+        chosen.ground_truth = Some(recorded.clone());
     }
-    let (target, goal) = (target_options.target(), target_options.goal().map_err(Error::usage)?);
+    let (target, goal) = (chosen.target(), chosen.goal().map_err(Error::usage)?);
     Ok(Request {
         input,
         output: args.output,
@@ -116,6 +119,7 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
         },
         target,
         goal,
+        photographs: chosen.ground_truth.filter(|_| toward == FitTarget::Photographs),
         keep_ids: args.overrides.keep_ids.or(run.keep_ids),
         drop_ids: args.overrides.drop_ids.or(run.drop_ids),
         keep_box: args.overrides.keep_box.or(run.keep_box),

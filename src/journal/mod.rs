@@ -14,7 +14,9 @@ use crate::cache::{Cache, CacheKey, Spill};
 use crate::error::Result;
 use crate::journal::as_toml::AsToml;
 use crate::journal::records::Forecast;
-use crate::journal::records::{FieldSummary, OmittedWork, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord};
+use crate::journal::records::{
+    FieldSummary, OmittedWork, PhotographSummary, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord,
+};
 use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
@@ -71,6 +73,8 @@ pub struct Journal {
     pub bands: Option<ShDegreeSummary>,
     /// PSNR before and after refinement, if the run refined.
     pub refined: Option<RefinedSummary>,
+    /// PSNR against photographs before and after the fit to them, if it changed the result.
+    pub photographs: Option<PhotographSummary>,
     /// Forecast of time and memory, if one was made before the run.
     pub forecast: Option<Forecast>,
 }
@@ -158,6 +162,7 @@ impl Journal {
         self.field = self.field.take().or(own.field);
         self.bands = self.bands.take().or(own.bands);
         self.refined = own.refined.or(self.refined);
+        self.photographs = own.photographs.or(self.photographs);
         Ok(found)
     }
 

@@ -146,6 +146,20 @@ pub struct RefinedSummary {
     pub result: f64,
 }
 
+/// PSNR against photographs before and after the model was fitted to photographs, measured on photographs that were held
+/// back from the fit.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PhotographSummary {
+    /// Number of photographs that were held back, which are used to choose the best state but not to fit.
+    pub photographs: usize,
+    /// Mean PSNR before the fit, of the model refined toward renders, dB.
+    #[serde(deserialize_with = "number")]
+    pub before: f64,
+    /// Mean PSNR after the fit, dB.
+    #[serde(deserialize_with = "number")]
+    pub result: f64,
+}
+
 /// Kind of the views on which the quality of a result was measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

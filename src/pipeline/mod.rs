@@ -22,7 +22,7 @@ pub mod time_estimate;
 pub use dry_run::dry_run;
 pub use open::open_to_measure;
 pub use plan::RunPlan;
-pub use record::{RecipeRecord, RunOptions};
+pub use record::{FitTarget, RecipeRecord, RunOptions};
 pub use request::{Goal, PruneOrMerge, Quality, Request, Target};
 
 use crate::cache::Completion;

@@ -25,6 +25,17 @@ pub struct Provenance {
     pub input_digest: String,
 }
 
+/// Images to which refinement fits the result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FitTarget {
+    /// Renders of the original model.
+    #[default]
+    Renders,
+    /// Renders of the original model, and then photographs of the training views.
+    Photographs,
+}
+
 /// Options of a run that affect the result, except the parameters of the recipe. A field is `None` if the user did not
 /// give the option.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -42,9 +53,11 @@ pub struct RunOptions {
     /// Maximum amount, dB, by which the mean PSNR against photographs may be lower for the output than for the original
     /// model.
     pub max_loss: Option<f64>,
-    /// Folder of the photographs with which renders are compared for the limit `max_loss` (maximum loss of PSNR against
-    /// photographs). In a recipe file the path is relative to the folder of the file.
+    /// Folder of the photographs for `max_loss` and `toward`. In a recipe file the path is relative to the folder of the
+    /// file.
     pub ground_truth: Option<PathBuf>,
+    /// Images to which the result is fitted.
+    pub toward: FitTarget,
     /// Maximum number of bytes of all output files together.
     pub target_size: Option<u64>,
     /// Minimum PSNR, dB, of renders of an archive against renders of the result before its values are quantized.
@@ -109,10 +122,26 @@ impl RunOptions {
     /// # Errors
     /// Fails with a message for the user in these cases:
     /// - there are several goals, or both a goal and a target number of Gaussians;
-    /// - `max_loss` or `ground_truth` (folder of photographs) is given without the other;
+    /// - `max_loss` or `toward = "photographs"` is given without `ground_truth` (folder of photographs), or
+    ///   `ground_truth` without both;
+    /// - `min_psnr`, which compares with renders of the original, is given with `toward = "photographs"`;
     /// - a value in decibels is out of range.
     pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
-        match (self.target(), self.min_psnr, self.max_loss, &self.ground_truth, self.target_size) {
+        let fits_photographs = self.toward == FitTarget::Photographs;
+        if self.ground_truth.is_some() != (self.max_loss.is_some() || fits_photographs) {
+            return Err(
+                "expected ground_truth, a folder of photographs, with max_loss or toward = \"photographs\", and \
+                        only with these"
+                    .to_owned(),
+            );
+        }
+        if fits_photographs && self.min_psnr.is_some() {
+            return Err("min_psnr compares with renders of the original, so it cannot be combined with toward = \
+                        \"photographs\": expected max_loss, or a target count, ratio or size"
+                .to_owned());
+        }
+        let photographs = self.ground_truth.as_ref().filter(|_| self.max_loss.is_some());
+        match (self.target(), self.min_psnr, self.max_loss, photographs, self.target_size) {
             (_, None, None, None, None) => Ok(None),
             (None, Some(least), None, None, None) => {
                 Ok(Some(Goal::Quality(Quality::Psnr(decibels("min_psnr", least)?))))
@@ -160,6 +189,9 @@ impl RecipeRecord {
             Some(Goal::Quality(Quality::Loss { most, photographs })) => {
                 (run.max_loss, run.ground_truth) = (Some(*most), Some(photographs.clone()));
             }
+        }
+        if let Some(photographs) = &request.photographs {
+            (run.toward, run.ground_truth) = (FitTarget::Photographs, Some(photographs.clone()));
         }
         let ids = |ids: &[u32]| (!ids.is_empty()).then(|| format_ranges(ids).join(","));
         let input = &request.input;

@@ -91,6 +91,9 @@ pub struct Request {
     pub target: Option<Target>,
     /// Goal (quality or size on disk) by which the number of Gaussians is found, if requested; then `target` is `None`.
     pub goal: Option<Goal>,
+    /// Folder with photographs of the training views, to which the result is fitted after its refinement toward renders
+    /// of the original; `None`: the result is fitted to renders only.
+    pub photographs: Option<PathBuf>,
     /// Ids of Gaussians to keep: a list such as `3,10-20`, or the path of a file with a list.
     pub keep_ids: Option<String>,
     /// Ids of Gaussians to drop: a list such as `3,10-20`, or the path of a file with a list.
@@ -115,6 +118,7 @@ impl Request {
             only: PruneOrMerge::Both,
             target: None,
             goal: None,
+            photographs: None,
             keep_ids: None,
             drop_ids: None,
             keep_box: None,

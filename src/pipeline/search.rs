@@ -193,7 +193,7 @@ impl SearchStage {
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
-            journal.refined = best.journal.refined;
+            (journal.refined, journal.photographs) = (best.journal.refined, best.journal.photographs);
             journal.notes.push(note(&summary, meter.search_view_count(), count, is_met));
             Ok(((best.result, AsToml(summary)), count))
         });

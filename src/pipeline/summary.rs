@@ -14,8 +14,8 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::names::name_of;
 use crate::journal::records::{
-    FieldSummary, FlagSummary, Forecast, OmittedWork, QualitySummary, RefinedSummary, ShDegreeSummary, StageRecord,
-    TermSummary, number, sizes,
+    FieldSummary, FlagSummary, Forecast, OmittedWork, PhotographSummary, QualitySummary, RefinedSummary,
+    ShDegreeSummary, StageRecord, TermSummary, number, sizes,
 };
 use crate::merging::PassCounts;
 use crate::models::{InputModel, ModelSize};
@@ -247,6 +247,9 @@ pub struct Summary {
     pub bands: Option<ShDegreeSummary>,
     /// PSNR before and after refinement; `None` if nothing was refined.
     pub refined: Option<RefinedSummary>,
+    /// PSNR against photographs before and after the fit to them; `None` if the result was not fitted to photographs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub photographs: Option<PhotographSummary>,
     /// Quality of the result on test views, or on validation or training views if there are none, and render times.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quality: Option<QualitySummary>,

@@ -7,11 +7,12 @@ use bytesize::ByteSize;
 
 use super::summary::{Summary, SummaryDetail};
 use crate::error::ShowPath;
-use crate::journal::records::{QualitySummary, ViewKind};
+use crate::journal::records::{PhotographSummary, QualitySummary, ViewKind};
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::models::ModelSize;
 use crate::outputs::kind::OutputKind;
 use crate::progress::format_duration;
+use crate::refinement::photographs::FIT;
 
 /// Maximum number of notes that the text of a summary shows unless all details are requested.
 const NOTES: usize = 2;
@@ -101,6 +102,16 @@ impl Summary {
             row(out, "Render time", &before, &after, "per view, one thread of this machine")?;
         }
         writeln!(out, "{:<14}  {}", "Quality", self.quality_text())?;
+        if let Some(PhotographSummary { photographs, before, result }) = self.photographs {
+            let held_back = counted(photographs, "photograph");
+            writeln!(
+                out,
+                "{:<14}  {result:.2} dB PSNR, {before:.2} dB before the fit to photographs ({held_back} not fitted to)",
+                "Photographs"
+            )?;
+        } else if let Some(left) = self.left_out.iter().find(|left| left.what == FIT) {
+            writeln!(out, "{:<14}  not fitted to: {}", "Photographs", left.reason())?;
+        }
         if let Some(goal) = &self.goal {
             let of = if goal.name == "max_loss" { "loss against photographs" } else { "PSNR vs. original" };
             let views = goal.held_pictures.len();

@@ -18,6 +18,7 @@ mod local;
 mod loss;
 pub mod optimizer;
 pub(crate) mod optimizer_state;
+pub(crate) mod photographs;
 pub(crate) mod prune_steps;
 mod run;
 mod survivors;
@@ -126,6 +127,11 @@ impl RefineStage {
     /// not vary with time.
     pub fn with_time_independent_deltas(self) -> RefineStage {
         RefineStage { knots: 0, ..self }
+    }
+
+    /// Returns a copy of this stage that removes no Gaussians.
+    pub fn without_prune_steps(self) -> RefineStage {
+        RefineStage { cuts: false, ..self }
     }
 
     /// Returns a copy of this stage with the numbers of optimization steps multiplied by `part` and rounded up, and

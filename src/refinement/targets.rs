@@ -1,24 +1,31 @@
-//! Target views: renders of the original model that refinement fits Gaussians to.
+//! Target views: renders of the original model, or photographs, that refinement fits Gaussians to.
 
 use std::num::NonZeroU32;
 use std::ops::Range;
 
+use hashbrown::HashSet;
 use rayon::prelude::*;
 
-use crate::cache::{Spill, SpillWriter};
+use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, FrameView, hash_id};
 use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, ViewStates, for_each_view_batch, select_evenly};
 use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
+use crate::scene::photographs::Photographs;
 use crate::scene::views_between::{SplitMix64, cameras_between};
 use crate::scene::views_outside::cameras_outside;
 
-/// Name of the cache entry of the target views.
+/// Name of the cache entry of the target views that show only renders.
 pub(crate) const NAME: &str = "targets";
+/// Name of the cache entry of the target views of which some show photographs.
+const PHOTOGRAPHS_NAME: &str = "photograph-targets";
 /// Numbers of target views by kind of camera, out of every 26. First: views from the scene's cameras. Second: views
 /// from new cameras, which are between two of the scene's cameras or outside the rig.
 const VIEW_SHARES: [usize; 2] = [3, 23];
+/// Numbers of target views by content, out of every 26, if some show photographs. First: photographs from the scene's
+/// cameras. Second: renders of the original from new cameras, which keep the result from overfitting the photographs.
+const PHOTOGRAPH_SHARES: [usize; 2] = [20, 6];
 /// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
 /// exceed it.
 const MAX_BYTES: u64 = 1 << 30;
@@ -29,6 +36,10 @@ const MIN_VIEWS: u64 = 96;
 const VALIDATION_EVERY: [usize; 2] = [16, 8];
 /// Minimum number of target views at which one of every 16, instead of one of every 8, is a validation view.
 const MANY_VIEWS: usize = 400;
+
+/// Number n for photographs used for validation: one of every n cameras, or of every n photographs if there are fewer
+/// than n cameras, is used only for validation.
+const VALIDATION_CAMERA_EVERY: usize = 8;
 
 /// Number n for test views: one of every n target views is a test view. Only runs with a quality target have test
 /// views, which they use only for the reported quality.
@@ -48,21 +59,34 @@ pub(crate) struct ViewSplit {
 /// Returns two numbers of target views: from the scene's cameras, and from new cameras. Their sum is at most
 /// `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
-    let count = (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize;
-    VIEW_SHARES.map(|part| part * count / 26)
+    shared_counts(VIEW_SHARES, max_views, pixels)
 }
 
-/// Target views: renders of the original model, in a scratch file. Their cameras are the cameras by which Gaussians are
-/// scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the rig. Of a training
-/// view only the pixels of a grid are rendered; of validation and test views, all pixels are.
+/// Returns the numbers of target views of two kinds, of which `shares` out of every 26 are of each kind. Their sum is
+/// at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
+fn shared_counts(shares: [usize; 2], max_views: usize, pixels: u64) -> [usize; 2] {
+    let count = (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize;
+    shares.map(|part| part * count / 26)
+}
+
+/// Returns the views from the scene's cameras whose photographs can be target views, at most as many as fit (see
+/// [`Targets::with_photographs`]). `max_views`: maximum number of all target views.
+pub(crate) fn photograph_views(scene: &Scene, max_views: usize) -> Vec<FrameView> {
+    let [count, _] = shared_counts(PHOTOGRAPH_SHARES, max_views, scene.workload().pixels);
+    select_evenly(&scene.schedule, count, VIEWS_PER_FRAME)
+}
+
+/// Target views in a scratch file: renders of the original model, or photographs. Their cameras are the cameras by which
+/// Gaussians are scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the rig. Of a
+/// training view only the pixels of a grid are stored; of validation and test views, all pixels are.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
     pub(crate) pictures: Vec<FrameView>,
-    /// Stride n of the training views: only every n-th column and row of pixels is rendered.
+    /// Purpose of each target view.
+    purposes: Vec<Purpose>,
+    /// Stride n of the training views: only every n-th column and row of pixels is stored.
     stride: NonZeroU32,
-    /// Whether every fourth view is a test view, used only for the reported quality.
-    has_test_views: bool,
     /// Scratch files, each with the range of consecutive views that it holds. A file has the color values (0 to 1 as
     /// 16-bit integers) of one view after the other.
     values: Vec<(Range<usize>, Spill)>,
@@ -92,30 +116,100 @@ impl Targets {
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.
     pub(crate) fn new(scene: &Scene, max_views: usize, stride: NonZeroU32, has_test_views: bool) -> Result<Targets> {
-        let (cameras, pictures) = choose_views(scene, max_views);
-        let mut targets = Targets { cameras, pictures, stride, has_test_views, values: Vec::new() };
+        let [scene_views, new_views] = view_counts(max_views, scene.workload().pixels);
+        let seen = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
+        let (cameras, pictures) = add_new_views(scene, seen, new_views);
+        let purposes = (0..pictures.len()).map(|k| purpose(k, pictures.len(), has_test_views)).collect();
+        let key = scene.work.key(&(&cameras, &pictures, stride, has_test_views));
+        let targets = Targets { cameras, pictures, purposes, stride, values: Vec::new() };
+        targets.filled(NAME, key, scene, |_| None)
+    }
+
+    /// Stores target views, at most `max_views`, of which some show photographs: the views `seen` from the scene's
+    /// cameras, which are [`photograph_views`] that have photographs. The others are renders of the original from new
+    /// cameras, which keep the result from overfitting the photographs. The validation views are the photographs of one
+    /// of every eight cameras (of fewer than eight cameras, one of every eight photographs); all other views are
+    /// training views. Of these only every `stride`-th column and row of pixels is stored.
+    ///
+    /// # Errors
+    /// Fails if a frame or a photograph cannot be read, or if the scratch file cannot be written.
+    pub(crate) fn with_photographs(
+        scene: &Scene,
+        max_views: usize,
+        stride: NonZeroU32,
+        (seen, photographs): (Vec<FrameView>, &Photographs),
+    ) -> Result<Targets> {
+        let [_, new_views] = shared_counts(PHOTOGRAPH_SHARES, max_views, scene.workload().pixels);
+        let key = scene.work.key(&(&seen, photographs.file_stamps(&seen)?, new_views, stride));
+        let rank_of_camera = scene.schedule.used_cameras();
+        let mut cameras_with_photographs: Vec<u32> = seen.iter().map(|picture| picture.camera).collect();
+        cameras_with_photographs.sort_unstable();
+        cameras_with_photographs.dedup();
+        let by_camera = cameras_with_photographs.len() >= VALIDATION_CAMERA_EVERY;
+        let is_validation = |(k, picture): &(usize, &FrameView)| {
+            let place = match by_camera {
+                true => cameras_with_photographs.binary_search(&picture.camera).unwrap_or_default(),
+                false => *k,
+            };
+            place % VALIDATION_CAMERA_EVERY == VALIDATION_CAMERA_EVERY / 2
+        };
+        let place = |picture: &FrameView| (picture.frame, picture.view);
+        let validation: HashSet<(usize, u32)> =
+            seen.iter().enumerate().filter(is_validation).map(|(_, picture)| place(picture)).collect();
+        let (cameras, pictures) = add_new_views(scene, seen, new_views);
+        let purpose = |picture: &FrameView| match validation.contains(&place(picture)) {
+            true => Purpose::Validation,
+            false => Purpose::Training,
+        };
+        let purposes = pictures.iter().map(purpose).collect();
+        let targets = Targets { cameras, pictures, purposes, stride, values: Vec::new() };
+        targets.filled(PHOTOGRAPHS_NAME, key, scene, |picture| {
+            // A view from a new camera has no photograph.
+            let camera = *rank_of_camera.get(picture.camera as usize)?;
+            let picture = FrameView { camera, ..picture };
+            photographs
+                .has(picture)
+                .then(|| photographs.read(picture, &scene.schedule.cameras[camera as usize], scene.background))
+        })
+    }
+
+    /// Returns these target views with their color values in a scratch file, under `name` and `key` in the cache. A view
+    /// shows the image that `photograph` returns for it, or, if this is `None`, a render of the original.
+    fn filled(
+        mut self,
+        name: &'static str,
+        key: CacheKey,
+        scene: &Scene,
+        photograph: impl Fn(FrameView) -> Option<Result<Image>> + Sync,
+    ) -> Result<Targets> {
         let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [RenderedSource::all_gaussians(scene.source())];
             let mut next = some.start;
             for_each_view_batch(
                 subject,
-                &targets.cameras,
-                &targets.pictures[some],
+                &self.cameras,
+                &self.pictures[some],
                 BatchLimits::one_frame(&scene.limits),
                 |views| {
                     let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
-                        let view_on_grid = targets.grid(next + k, stride).sampled_view(view.camera);
-                        narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
+                        let grid = self.grid(next + k, self.stride);
+                        Ok(narrow(&match photograph(view.picture) {
+                            Some(photograph) => sampled(&photograph?, grid),
+                            None => Renderer::on_all_threads().render(
+                                view.states[0],
+                                grid.sampled_view(view.camera),
+                                scene.background,
+                            ),
+                        }))
                     };
-                    let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
+                    let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect::<Result<_>>()?;
                     next += views.len();
                     made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
                 },
             )
         };
-        let key = scene.work.key(&(&targets.cameras, &targets.pictures, stride, has_test_views));
-        targets.values = scene.work.spill_in_shards(NAME, key, targets.pictures.len(), &scene.scratch, make)?;
-        Ok(targets)
+        self.values = scene.work.spill_in_shards(name, key, self.pictures.len(), &scene.scratch, make)?;
+        Ok(self)
     }
 
     /// Returns the stride n of the training views: only every n-th column and row of pixels was rendered.
@@ -125,19 +219,11 @@ impl Targets {
 
     /// Returns the indices of the training, validation and test views.
     pub(crate) fn split(&self) -> ViewSplit {
-        let with_purpose = |purpose| (0..self.pictures.len()).filter(|&k| self.purpose(k) == purpose).collect();
+        let with_purpose = |purpose| (0..self.pictures.len()).filter(|&k| self.purposes[k] == purpose).collect();
         ViewSplit {
             training: with_purpose(Purpose::Training),
             validation: with_purpose(Purpose::Validation),
             test: with_purpose(Purpose::Test),
-        }
-    }
-
-    fn purpose(&self, k: usize) -> Purpose {
-        match () {
-            () if self.has_test_views && k % TEST_EVERY == TEST_EVERY - 1 => Purpose::Test,
-            () if k % validation_every(self.pictures.len()) == 1 => Purpose::Validation,
-            () => Purpose::Training,
         }
     }
 
@@ -146,7 +232,7 @@ impl Targets {
     /// come from a hash of `k`, so that different training views sample different pixels. `stride` must be a multiple
     /// of [`Targets::stride`].
     fn grid(&self, k: usize, stride: NonZeroU32) -> PixelGrid {
-        match self.purpose(k) {
+        match self.purposes[k] {
             Purpose::Training => {
                 let hash = hash_id(k as u64);
                 PixelGrid::new(stride, [hash as u32, (hash >> 32) as u32])
@@ -203,12 +289,20 @@ pub(super) fn validation_every(views: usize) -> usize {
     VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
 }
 
-/// Chooses at most `max_views` target views and their cameras: views by which Gaussians are scored, views from cameras
-/// between these cameras, and, if [`Scene::outside`] is not 0, views from cameras outside the rig. Returns the cameras,
-/// and the views sorted by frame.
-fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
-    let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
-    let mut pictures = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
+/// Returns the purpose of target view `k` of `count`, if all of them show renders. If `has_test_views`, every fourth view
+/// is a test view.
+fn purpose(k: usize, count: usize, has_test_views: bool) -> Purpose {
+    match () {
+        () if has_test_views && k % TEST_EVERY == TEST_EVERY - 1 => Purpose::Test,
+        () if k % validation_every(count) == 1 => Purpose::Validation,
+        () => Purpose::Training,
+    }
+}
+
+/// Adds to the views `pictures`, by which Gaussians are scored, `between_views` views from new cameras: cameras between
+/// those of the scene and, if [`Scene::outside`] is not 0, cameras outside the rig. Returns the cameras, and the views
+/// sorted by frame.
+fn add_new_views(scene: &Scene, mut pictures: Vec<FrameView>, between_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let used = scene.schedule.used_cameras();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
     for picture in &mut pictures {
@@ -234,6 +328,17 @@ fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>
 pub(crate) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
     let square = |(value, &wanted): (&f32, &u16)| f64::from(value.clamp(0.0, 1.0) - wide(wanted)).powi(2);
     picture.data.iter().zip(target).map(square).sum::<f64>() / target.len().max(1) as f64
+}
+
+/// Returns the pixels of `image` that are on `grid`.
+fn sampled(image: &Image, grid: PixelGrid) -> Image {
+    let [width, height] = grid.size([image.width, image.height]);
+    let row = |y: u32| (0..width).map(move |x| [grid.pixel(0, x), grid.pixel(1, y)]);
+    let color = |[x, y]: [u32; 2]| {
+        let at = 3 * (y as usize * image.width as usize + x as usize);
+        image.data[at..at + 3].to_vec()
+    };
+    Image { width, height, data: (0..height).flat_map(row).flat_map(color).collect() }
 }
 
 /// Converts the color values of a render, 0 to 1, to 16-bit integers. Values outside this range are clamped.

@@ -103,6 +103,9 @@ fn contradictory_targets_are_refused() {
     for (arguments, part) in [
         ("--max-loss 0.5", "--ground-truth"),
         ("--ground-truth {tiny}", "--max-loss"),
+        ("--toward photographs", "ground_truth"),
+        ("--toward renders --ground-truth {tiny}", "ground_truth"),
+        ("--toward photographs --ground-truth {tiny} --min-psnr 35", "min_psnr"),
         ("--min-psnr 35 --ratio 0.5", "--ratio"),
         ("--min-psnr 35 --size 5MB", "--size"),
         ("--min-psnr many", "decibels"),

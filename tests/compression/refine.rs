@@ -70,6 +70,54 @@ fn ssim_weight_raises_ssim_and_costs_at_most_1_db() {
     assert!(more > similarity + 0.005 && fewer > decibels - 1.0, "without and with: {found:?}");
 }
 
+/// Makes the photographs of the folder `photographs` that have an odd view number 1.5 times as bright.
+fn brighten_every_other_view(photographs: &Path) {
+    for entry in std::fs::read_dir(photographs).unwrap() {
+        let path = entry.unwrap().path();
+        let view: u32 = path.file_stem().unwrap().to_str().unwrap().rsplit_once('v').unwrap().1.parse().unwrap();
+        if view % 2 == 1 {
+            let mut image = image::open(&path).unwrap().to_rgb8();
+            image.iter_mut().for_each(|value| *value = (f32::from(*value) * 1.5).min(255.0) as u8);
+            image.save(&path).unwrap();
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs time"]
+fn fit_to_photographs_is_kept_only_if_it_is_closer_to_held_back_photographs() {
+    let workplace = Workplace::new();
+    workplace.done("test-scene --gaussians 1500 --frames 6 -o demo");
+    let original = "demo/scene.gseq --cameras demo/cameras.json";
+    workplace.done(&format!("render {original} --all --split all -o photographs"));
+    // The "trained" model lacks Gaussians of the scene that the photographs show.
+    workplace.done(&format!("compress {original} --ratio 0.4 --prune-only --no-refine -o trained.gseq"));
+    let fit = "trained.gseq --cameras demo/cameras.json --ratio 0.5 --set refine_steps=600 --overwrite";
+    let with_photographs = format!("{fit} --toward photographs --ground-truth photographs -o small.gseq");
+    let summary = workplace.summary(&with_photographs);
+    let [before, after] = ["before", "result"].map(|name| summary["photographs"][name].as_f64().unwrap());
+    assert!(after > before + 1.0, "{}", summary["photographs"]);
+    let json = workplace
+        .done("evaluate trained.gseq small.gseq --cameras demo/cameras.json --ground-truth photographs --json");
+    let truth = &serde_json::from_str::<serde_json::Value>(&json).unwrap()["ground_truth"];
+    let [trained, small] = [&truth["original"]["psnr"], &truth["psnr"]].map(|psnr| psnr.as_f64().unwrap());
+    assert!(small > trained, "test views against photographs: {small} dB, the trained model {trained} dB");
+    let text = std::fs::read_to_string(workplace.path("small.gseq.recipe.toml")).unwrap();
+    assert!(text.contains("toward = \"photographs\""), "{text}");
+
+    // Photographs that contradict each other change nothing.
+    brighten_every_other_view(&workplace.path("photographs"));
+    let summary = workplace.summary(&with_photographs);
+    assert!(summary["photographs"].is_null(), "{summary}");
+    assert!(summary["left_out"].to_string().contains("refinement toward photographs"), "{}", summary["left_out"]);
+    let guarded = std::fs::read(workplace.path("small.gseq")).unwrap();
+    workplace.done(&format!("compress {fit} -o small.gseq"));
+    assert!(
+        guarded == std::fs::read(workplace.path("small.gseq")).unwrap(),
+        "the guarded run differs from one without"
+    );
+}
+
 #[test]
 fn refinement_changes_only_named_unprotected_values() {
     let workplace = Workplace::new();

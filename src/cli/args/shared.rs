@@ -10,6 +10,7 @@ use splatsieve::cache::Shard;
 use splatsieve::files::atomic::Replace;
 use splatsieve::files::cameras::TimesSource;
 use splatsieve::models::LinkMode;
+use splatsieve::pipeline::FitTarget;
 
 /// Input of a command.
 #[derive(Debug, Args)]
@@ -164,6 +165,24 @@ impl From<LinkArg> for LinkMode {
             LinkArg::Always => LinkMode::Always,
             LinkArg::Apart => LinkMode::Apart,
             LinkArg::Never => LinkMode::Never,
+        }
+    }
+}
+
+/// Images to which refinement fits the Gaussians.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum FitTargetArg {
+    /// Renders of the original
+    Renders,
+    /// Renders of the original, then photographs of the training views
+    Photographs,
+}
+
+impl From<FitTargetArg> for FitTarget {
+    fn from(given: FitTargetArg) -> FitTarget {
+        match given {
+            FitTargetArg::Renders => FitTarget::Renders,
+            FitTargetArg::Photographs => FitTarget::Photographs,
         }
     }
 }

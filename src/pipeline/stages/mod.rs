@@ -9,6 +9,7 @@ pub(crate) mod degree;
 pub(crate) mod field;
 pub mod measure;
 pub(crate) mod merge;
+pub(crate) mod photographs;
 pub(crate) mod prune;
 pub(crate) mod quality;
 pub(crate) mod reference_views;
@@ -34,6 +35,7 @@ pub(super) const STAGES: &[PlanStage] = &[
     merge::plan,
     choose::plan,
     refine::plan,
+    photographs::plan,
     field::plan,
     bands::plan,
     size::plan_shrink,

@@ -134,7 +134,8 @@ impl QualityStage {
         let times = &scene.source().info().times;
         let kind = match scene.rig.held_out_split() {
             Some(_) => ViewKind::Test,
-            None if journal.refined.is_some() => ViewKind::Validation,
+            // The PSNR of the validation views is that before a fit to photographs.
+            None if journal.refined.is_some() && journal.photographs.is_none() => ViewKind::Validation,
             None if scene.has_cameras => ViewKind::Training,
             None => ViewKind::Virtual,
         };

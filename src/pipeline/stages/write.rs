@@ -131,6 +131,7 @@ impl Stage for WriteStage {
             field: journal.field,
             bands: journal.bands,
             refined: journal.refined,
+            photographs: journal.photographs,
             quality: run.quality,
             archive,
             left_out: journal.left_out,
