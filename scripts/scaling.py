@@ -51,7 +51,7 @@ def units(command):
     advance.
     """
     found = {}
-    for line in measured([*command, "--list-stages"])[0].splitlines():
+    for line in measured([*command, "--dry-run=stages"])[0].splitlines():
         name, what = line.split(": ", 1)
         number = re.match(r"\d+", what)
         found[name] = int(number[0]) if number else None

@@ -19,10 +19,10 @@ Option = Union[None, bool, int, float, str, "os.PathLike[str]", Sequence[Any], M
 # Function that is called with every progress line of the program.
 Log = Callable[[str], object]
 
-# Options that take no value; the other boolean options take `=true` and `=false`.
+# Options that can be given without a value; the other boolean options take `=true` and `=false`.
 SWITCHES = frozenset(
-    "all allow_gaps check clean dry_run explain flip json list_stages merge_only no_refine overwrite prune_only quiet raw "
-    "render_time verbose".split()
+    "all allow_gaps check clean dry_run explain flip json merge_only no_refine overwrite prune_only quiet raw "
+    "render_time verbose view".split()
 )
 
 

@@ -40,7 +40,7 @@ def quoted(words):
 
 def stages(compress):
     """Returns the stages that --shard divides."""
-    listed = subprocess.run([*compress, "--list-stages"], stdout=subprocess.PIPE, text=True, check=False)
+    listed = subprocess.run([*compress, "--dry-run=stages"], stdout=subprocess.PIPE, text=True, check=False)
     if listed.returncode != 0:
         sys.exit(listed.returncode)
     return [line.split(":")[0] for line in listed.stdout.splitlines()]
@@ -83,7 +83,7 @@ def main():
     compress = words[cut + 1 :]
     if not compress or args.parts < 1:
         parser.error("expected at least one part and, behind --, what splatsieve compress takes")
-    if taken := [word for word in compress if word.split("=")[0] in ("--cache", "--shard", "--list-stages", "--dry-run")]:
+    if taken := [word for word in compress if word.split("=")[0] in ("--cache", "--shard", "--dry-run")]:
         parser.error(f"{taken[0]} is this script's own")
     args.cache, args.logs = os.path.abspath(args.cache), os.path.abspath(args.logs or args.cache.rstrip("/") + ".logs")
     script = "\n".join(lines(args, sbatch, [found(args.program), "compress", *compress])) + "\n"

@@ -9,8 +9,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 pub(super) use self::shared::{
-    CacheArgs, CameraFile, Cameras, Earlier, FitTargetArg, Input, LinkArg, Memory, OutputKindArg, Rot4d, SplitArg,
-    Trained, ZeroRotationArg,
+    CacheArgs, CameraFile, Cameras, DryRun, Earlier, FitTargetArg, Input, LinkArg, Memory, OutputKindArg, Rot4d,
+    SplitArg, Trained, ZeroRotationArg,
 };
 pub(super) use self::study::{PrecisionArgs, Sweep};
 use self::values::{parse_box, parse_bytes, parse_color, parse_decibels, parse_ratio};
@@ -148,13 +148,13 @@ pub(super) struct Compress {
     #[command(flatten)]
     pub(super) overrides: OverrideArgs,
     /// Check everything and print the plan, time and memory; write nothing
-    #[arg(long)]
-    pub(super) dry_run: bool,
+    ///
+    /// With --dry-run=stages, print only the stages that --shard divides, in order, with their units.
+    #[arg(long, value_name = "stages", num_args = 0..=1, require_equals = true, default_missing_value = "plan")]
+    #[arg(hide_possible_values = true)]
+    pub(super) dry_run: Option<DryRun>,
     #[command(flatten)]
     pub(super) kept: CacheArgs,
-    /// List the stages that --shard divides, in order, with their units, and do nothing else
-    #[arg(long, conflicts_with = "shard", help_heading = CACHE, hide_short_help = true)]
-    pub(super) list_stages: bool,
     /// Write a page, too, that plays the result beside the original, as `view` does [default: OUTPUT.html]
     #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, hide_short_help = true)]
     #[arg(conflicts_with_all = ["dry_run", "shard"])]
@@ -177,7 +177,6 @@ pub(super) struct Compress {
 /// Target of the compression [default: remove Gaussians that views hardly show].
 #[derive(Debug, Args)]
 #[command(group(clap::ArgGroup::new("size_of_output")))]
-#[command(group(clap::ArgGroup::new("photograph_user").args(["max_loss", "toward"]).multiple(true)))]
 pub(super) struct OutputSize {
     /// Fraction of the Gaussians to keep, exactly: 0.1, 10% or 10x (a tenth)
     #[arg(long, help_heading = HOW_SMALL, value_name = "FRACTION", group = "size_of_output", value_parser = parse_ratio)]
@@ -194,13 +193,13 @@ pub(super) struct OutputSize {
     #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels)]
     pub(super) min_psnr: Option<f64>,
     /// Smallest output that loses at most this much PSNR against the photographs of --ground-truth, such as 0.5dB
-    #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels, requires = "ground_truth")]
+    #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels)]
     pub(super) max_loss: Option<f64>,
-    /// Folder with photographs: of the test views for --max-loss, of the training views for --toward
+    /// Folder of photographs: test views for --max-loss, training views for --toward
     ///
     /// Files as the cameras name them, else tNNN_vNN.png. A quarter of those of the test views is not used in the search
     /// and gives the reported value.
-    #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER", requires = "photograph_user")]
+    #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER")]
     pub(super) ground_truth: Option<PathBuf>,
     /// Images to fit the Gaussians to: photographs needs --ground-truth [default: renders, those of the original]
     ///

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::args::{
-    CacheFolder, Cli, CommandArgs, Completions, Compress, Convert, Demo, Evaluate, InfoArgs, Man, PrecisionArgs,
-    Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene, ViewArgs,
+    CacheFolder, Cli, CommandArgs, Completions, Compress, Convert, Demo, DryRun, Evaluate, InfoArgs, Man,
+    PrecisionArgs, Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene, ViewArgs,
 };
 use super::help;
 use super::message::show;
@@ -62,19 +62,22 @@ pub(super) fn run(cli: Cli) -> Result<()> {
     }
 }
 
-/// Runs the command `compress` and prints its summary. With `--list-stages`, only prints the stages that can be divided
-/// into shards. With `--dry-run`, only prints the plan of the run. `quiet`: whether progress is hidden.
+/// Runs the command `compress` and prints its summary. With `--dry-run`, only prints the plan of the run; with
+/// `--dry-run=stages`, only the stages that can be divided into shards. `quiet`: whether progress is hidden.
 fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
-    let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
+    let (json, dry_run) = (args.json, args.dry_run);
     let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Brief };
     let page_output = args.view.clone();
     let request = compress_options(args, quiet, events)?;
-    if list_stages {
-        return print(&shardable_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
-    }
-    if dry_run {
-        let foreseen = pipeline::dry_run(&request)?;
-        return print_as(json, || foreseen.json(), || foreseen.text());
+    match dry_run {
+        None => (),
+        Some(DryRun::Stages) => {
+            return print(&shardable_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
+        }
+        Some(DryRun::Plan) => {
+            let foreseen = pipeline::dry_run(&request)?;
+            return print_as(json, || foreseen.json(), || foreseen.text());
+        }
     }
     let page = page_output.map(|output| result_page_options(&request, output)).transpose()?;
     let Some(summary) = completed(compress(&request)?)? else { return Ok(()) };

@@ -124,7 +124,8 @@ impl Journal {
         })
     }
 
-    /// Returns the mean PSNR of the result against the original on validation views (used to choose, not to fit), dB.
+    /// Returns the mean PSNR of the result, before a fit to photographs, against the original on validation views (used
+    /// to choose, not to fit), dB.
     /// The value is from the last stage that measured it; `None` if no stage did.
     pub fn result_psnr(&self) -> Option<f64> {
         let bands = self.bands.as_ref().map(|bands| bands.result);

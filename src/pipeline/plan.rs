@@ -300,6 +300,17 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
              target count or ratio",
         ));
     }
+    match (goal, &request.photographs) {
+        (Some(Goal::Quality(Quality::Psnr(_))), Some(_)) => {
+            return Err(Error::usage(
+                "a minimum PSNR against the original cannot be combined with a fit to photographs",
+            ));
+        }
+        (Some(Goal::Quality(Quality::Loss { photographs, .. })), Some(fitted)) if fitted != photographs => {
+            return Err(Error::usage("the photographs of the test views and of the fit: expected one folder for both"));
+        }
+        _ => (),
+    }
     if request.kind.is_none() {
         OutputKind::check_name(&request.output)?;
     }

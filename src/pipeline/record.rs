@@ -129,15 +129,13 @@ impl RunOptions {
     pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
         let fits_photographs = self.toward == FitTarget::Photographs;
         if self.ground_truth.is_some() != (self.max_loss.is_some() || fits_photographs) {
-            return Err(
-                "expected ground_truth, a folder of photographs, with max_loss or toward = \"photographs\", and \
-                        only with these"
-                    .to_owned(),
-            );
+            return Err("expected --ground-truth, a folder of photographs, together with --max-loss or --toward \
+                        photographs, and only with these"
+                .to_owned());
         }
         if fits_photographs && self.min_psnr.is_some() {
-            return Err("min_psnr compares with renders of the original, so it cannot be combined with toward = \
-                        \"photographs\": expected max_loss, or a target count, ratio or size"
+            return Err("--min-psnr compares with renders of the original, so it cannot be combined with --toward \
+                        photographs: expected --max-loss, --count, --ratio or --size, or --toward renders"
                 .to_owned());
         }
         let photographs = self.ground_truth.as_ref().filter(|_| self.max_loss.is_some());

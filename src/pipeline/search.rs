@@ -77,6 +77,8 @@ pub struct SearchStage {
     pictures: usize,
     /// Refinement stage, which is run at every size; `None` if nothing is refined.
     refine: Option<RefineStage>,
+    /// Whether every tried model is also fitted to photographs, those in the folder of [`Quality::Loss`].
+    fits_photographs: bool,
     /// Margins of PSNR, dB, that decide about two optional reductions of the model. First: storing the deformation
     /// field in half precision ([`FieldPrecisionStage::margin`]); `None` if the field stays exact. Second: dropping SH
     /// degrees ([`ShDegreeStage::margin`]); `None` if all degrees stay.
@@ -108,6 +110,7 @@ impl SearchStage {
             searched,
             pictures: request.recipe.refine.refine_pictures,
             refine: planning.refine.clone(),
+            fits_photographs: request.photographs.is_some(),
             margins: [field, bands],
         })
     }
@@ -252,7 +255,7 @@ impl SearchStage {
         }
         let refine = self.refine.as_ref().map(RefineStage::key);
         Ok(scene.work.key(&(
-            (asked, files, self.pictures, self.margins[0], self.margins[1], refine),
+            (asked, files, self.pictures, self.fits_photographs, self.margins[0], self.margins[1], refine),
             &scored.protected,
             ranked,
             template,

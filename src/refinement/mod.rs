@@ -207,6 +207,12 @@ impl RefineStage {
     /// Estimates the memory and time that this stage needs for the input `work`: frame states, the optimizer, and a
     /// view with its gradient.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+        self.estimate_for_views(work, limits, targets::view_counts(self.pictures, work.pixels))
+    }
+
+    /// Estimates memory and time as [`RefineStage::resource_estimate`] does, for `own` target views from the scene's
+    /// cameras and `between` from new cameras.
+    fn estimate_for_views(&self, work: &Workload, limits: &Limits, [own, between]: [usize; 2]) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
         let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
@@ -244,7 +250,6 @@ impl RefineStage {
         let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
         let stages = [Some(original), Some(phase(wanted.max(MIN_START_FRACTION), None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
-        let [own, between] = targets::view_counts(self.pictures, work.pixels);
         let (pictures, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let prune_counts =

@@ -1,49 +1,79 @@
 //! Refinement toward photographs: fits a compressed model, already refined toward renders of the original, to
 //! photographs of the training views.
 
+use std::path::Path;
+
 use super::RefineStage;
 use super::run::RefineRun;
-use super::targets::{Targets, photograph_views};
+use super::targets::{Targets, photograph_counts};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::records::PhotographSummary;
-use crate::model::FrameView;
+use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload};
+use crate::model::{FrameView, ViewSchedule};
+use crate::passes::{VIEWS_PER_FRAME, select_evenly};
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 
 /// Name of the stage in plans, progress and summaries.
 pub(crate) const NAME: &str = "photographs";
-/// Name of the fit among the omitted work, if the photographs that are held back do not become closer.
+/// Name of the fit in the list of omitted work.
 pub(crate) const FIT: &str = "refinement toward photographs";
 /// Minimum number of photographs with which the model is fitted to photographs.
 const MIN_PHOTOGRAPHS: usize = 8;
+/// Bytes of memory per pixel while a photograph is decoded: 16-bit RGBA, the same as floats, and the image.
+const DECODE_BYTES_PER_PIXEL: u64 = 36;
 
 impl RefineStage {
-    /// Returns the photographs in `folder` that the refinement fits Gaussians to, and their views, sorted by frame.
+    /// Returns the photographs in `folder` that the fit uses, for training or validation, and their views, spread over
+    /// frames and cameras and sorted by frame.
     ///
     /// # Errors
-    /// Fails if the folder cannot be read, or if it has photographs of fewer than [`MIN_PHOTOGRAPHS`] of these views.
-    pub(crate) fn find_photographs(
-        &self,
-        scene: &Scene,
-        folder: &std::path::Path,
-    ) -> Result<(Vec<FrameView>, Photographs)> {
-        let views = photograph_views(scene, self.pictures);
+    /// Fails if the folder cannot be read, if it has photographs of fewer than [`MIN_PHOTOGRAPHS`] views, or if two
+    /// views of a frame have the same number.
+    pub(crate) fn find_photographs(&self, scene: &Scene, folder: &Path) -> Result<(Vec<FrameView>, Photographs)> {
+        let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<FrameView> {
+            views.iter().map(|&(view, camera)| FrameView { frame, view, camera }).collect()
+        };
+        // Views from cameras outside the rig, which the program places, have no number.
+        let views: Vec<FrameView> = scene.schedule.iter().enumerate().flat_map(of_frame).collect();
+        let views: Vec<FrameView> = views.into_iter().filter(|view| view.view != u32::MAX).collect();
         let looked_for = views.len();
-        let found = Photographs::find(folder, &scene.rig, &scene.source().info().times, views)?;
-        match found.0.len() {
-            ..MIN_PHOTOGRAPHS => Err(Error::input(
-                folder,
-                "",
-                format!(
-                    "photographs of {MIN_PHOTOGRAPHS} or more of the {looked_for} training views that --toward uses"
-                ),
-                format!("{} of them", found.0.len()),
-            )),
-            _ => Ok(found),
+        let (found, photographs) = Photographs::find(folder, &scene.rig, &scene.source().info().times, views)?;
+        if found.len() < MIN_PHOTOGRAPHS {
+            let expected = format!("photographs of {MIN_PHOTOGRAPHS} or more of the {looked_for} training views");
+            return Err(Error::input(folder, "", expected, format!("{} of them", found.len())));
         }
+        let mut schedule = ViewSchedule::new(scene.schedule.cameras.clone());
+        let mut left = found.as_slice();
+        for frame in 0..=found.last().map_or(0, |last| last.frame) {
+            let here;
+            (here, left) = left.split_at(left.partition_point(|view| view.frame == frame));
+            let mut pairs: Vec<(u32, u32)> = here.iter().map(|view| (view.view, view.camera)).collect();
+            pairs.sort_unstable();
+            if let Some(pair) = pairs.windows(2).find(|pair| pair[0].0 == pair[1].0 && pair[0].1 != pair[1].1) {
+                let number = pair[0].0;
+                return Err(Error::usage(format!(
+                    "--toward photographs: two cameras are view {number} at frame {frame}: expected different numbers\n  \
+                     choose one part with --split train"
+                )));
+            }
+            pairs.dedup();
+            schedule.push_frames(1, &pairs);
+        }
+        let [count, _] = photograph_counts(self.pictures, scene.workload().pixels);
+        Ok((select_evenly(&schedule, count, VIEWS_PER_FRAME), photographs))
+    }
+
+    /// Estimates the memory and time of the fit to photographs for the input `work`.
+    pub(crate) fn photographs_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+        let mut need = self.estimate_for_views(work, limits, photograph_counts(self.pictures, work.pixels));
+        need.stage = NAME;
+        need.fixed.push(("photographs", work.threads * DECODE_BYTES_PER_PIXEL * work.pixels));
+        need
     }
 
     /// Fits the model `reduction` to `photographs` of the views `seen`, and to renders of the original from new cameras.
@@ -62,11 +92,15 @@ impl RefineStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let count = reduction.len();
+        if self.last_steps(count as f64 / scored.gaussian_count().max(1) as f64) == 0 {
+            journal.leave_out(FIT, "no Gaussians were removed");
+            return Ok(reduction);
+        }
         let key = (self.key(), &reduction, &seen, photographs.file_stamps(&seen)?, &scored.protected);
         let key = scene.work.key(&key);
         journal.run_cached_stage(NAME, count, scene, key, |journal| {
             let stride = self.stride(scene.workload().pixels, count);
-            let targets = Targets::with_photographs(scene, self.pictures, stride, (seen, photographs))?;
+            let targets = Targets::with_photographs(scene, stride, (seen, photographs))?;
             let parts = targets.split();
             let held_back = parts.validation.len();
             // The notes of a refinement are about renders of the original, so they are not taken over.
@@ -78,8 +112,11 @@ impl RefineStage {
                     journal.photographs = Some(PhotographSummary { photographs: held_back, before, result });
                 }
                 None => {
-                    let why = format!("it did not improve the PSNR against {held_back} photographs held back for it");
-                    journal.leave_out(FIT, why);
+                    let not_closer =
+                        || format!("the {held_back} photographs that were held back did not become closer");
+                    // Another reason, such as a PSNR that is not a number, is in the journal of the fit.
+                    let other = own.left_out.into_iter().find(|left| !left.why.contains("did not improve"));
+                    journal.leave_out(FIT, other.map_or_else(not_closer, |left| left.why));
                 }
             }
             Ok((result, count))

@@ -235,8 +235,8 @@ impl<'a> RefineRun<'a> {
         targets: &'a Targets,
         parts: ViewSplit,
     ) -> RefineRun<'a> {
-        let views = (&targets.cameras, &targets.pictures, &parts.training, &parts.validation);
-        let key = scene.work.key(&(refine.key(), views, &scored.protected));
+        let views = (&parts.training, &parts.validation);
+        let key = targets.key.extended_by(&(refine.key(), views, &scored.protected));
         let (sampler, validation) = (EpochSampler::new(parts.training), parts.validation);
         let progress = scene.events.task(stage, "steps", 0);
         RefineRun { refine, scene, scored, targets, sampler, validation, stage, progress, key }

@@ -69,11 +69,10 @@ fn shared_counts(shares: [usize; 2], max_views: usize, pixels: u64) -> [usize; 2
     shares.map(|part| part * count / 26)
 }
 
-/// Returns the views from the scene's cameras whose photographs can be target views, at most as many as fit (see
-/// [`Targets::with_photographs`]). `max_views`: maximum number of all target views.
-pub(crate) fn photograph_views(scene: &Scene, max_views: usize) -> Vec<FrameView> {
-    let [count, _] = shared_counts(PHOTOGRAPH_SHARES, max_views, scene.workload().pixels);
-    select_evenly(&scene.schedule, count, VIEWS_PER_FRAME)
+/// Returns two numbers of target views if some show photographs: photographs, and renders from new cameras. Their sum is
+/// at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
+pub(super) fn photograph_counts(max_views: usize, pixels: u64) -> [usize; 2] {
+    shared_counts(PHOTOGRAPH_SHARES, max_views, pixels)
 }
 
 /// Target views in a scratch file: renders of the original model, or photographs. Their cameras are the cameras by which
@@ -87,6 +86,8 @@ pub(crate) struct Targets {
     purposes: Vec<Purpose>,
     /// Stride n of the training views: only every n-th column and row of pixels is stored.
     stride: NonZeroU32,
+    /// Cache key of the target views and of what they show.
+    pub(super) key: CacheKey,
     /// Scratch files, each with the range of consecutive views that it holds. A file has the color values (0 to 1 as
     /// 16-bit integers) of one view after the other.
     values: Vec<(Range<usize>, Spill)>,
@@ -121,27 +122,26 @@ impl Targets {
         let (cameras, pictures) = add_new_views(scene, seen, new_views);
         let purposes = (0..pictures.len()).map(|k| purpose(k, pictures.len(), has_test_views)).collect();
         let key = scene.work.key(&(&cameras, &pictures, stride, has_test_views));
-        let targets = Targets { cameras, pictures, purposes, stride, values: Vec::new() };
-        targets.filled(NAME, key, scene, |_| None)
+        let targets = Targets { cameras, pictures, purposes, stride, key, values: Vec::new() };
+        targets.filled(NAME, scene, |_| None)
     }
 
-    /// Stores target views, at most `max_views`, of which some show photographs: the views `seen` from the scene's
-    /// cameras, which are [`photograph_views`] that have photographs. The others are renders of the original from new
-    /// cameras, which keep the result from overfitting the photographs. The validation views are the photographs of one
-    /// of every eight cameras (of fewer than eight cameras, one of every eight photographs); all other views are
-    /// training views. Of these only every `stride`-th column and row of pixels is stored.
+    /// Stores target views of which the views `seen`, from the scene's cameras, show their photographs. The others are
+    /// renders of the original from new cameras, which keep the result from overfitting the photographs; their number is
+    /// in a fixed ratio to that of the photographs. The validation views are the photographs of one of every eight
+    /// cameras (of fewer than eight cameras, one of every eight photographs); all other views are training views. Of
+    /// these only every `stride`-th column and row of pixels is stored.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the scratch file cannot be written.
     pub(crate) fn with_photographs(
         scene: &Scene,
-        max_views: usize,
         stride: NonZeroU32,
         (seen, photographs): (Vec<FrameView>, &Photographs),
     ) -> Result<Targets> {
-        let [_, new_views] = shared_counts(PHOTOGRAPH_SHARES, max_views, scene.workload().pixels);
-        let key = scene.work.key(&(&seen, photographs.file_stamps(&seen)?, new_views, stride));
-        let rank_of_camera = scene.schedule.used_cameras();
+        let new_views = seen.len() * PHOTOGRAPH_SHARES[1] / PHOTOGRAPH_SHARES[0];
+        // Index in the schedule of each of the cameras that `add_new_views` lists first.
+        let used = scene.schedule.used_cameras();
         let mut cameras_with_photographs: Vec<u32> = seen.iter().map(|picture| picture.camera).collect();
         cameras_with_photographs.sort_unstable();
         cameras_with_photographs.dedup();
@@ -153,19 +153,21 @@ impl Targets {
             };
             place % VALIDATION_CAMERA_EVERY == VALIDATION_CAMERA_EVERY / 2
         };
-        let place = |picture: &FrameView| (picture.frame, picture.view);
+        let frame_and_view = |picture: &FrameView| (picture.frame, picture.view);
         let validation: HashSet<(usize, u32)> =
-            seen.iter().enumerate().filter(is_validation).map(|(_, picture)| place(picture)).collect();
+            seen.iter().enumerate().filter(is_validation).map(|(_, picture)| frame_and_view(picture)).collect();
+        let stamps = photographs.file_stamps(&seen)?;
         let (cameras, pictures) = add_new_views(scene, seen, new_views);
-        let purpose = |picture: &FrameView| match validation.contains(&place(picture)) {
+        let purpose = |picture: &FrameView| match validation.contains(&frame_and_view(picture)) {
             true => Purpose::Validation,
             false => Purpose::Training,
         };
         let purposes = pictures.iter().map(purpose).collect();
-        let targets = Targets { cameras, pictures, purposes, stride, values: Vec::new() };
-        targets.filled(PHOTOGRAPHS_NAME, key, scene, |picture| {
+        let key = scene.work.key(&(&cameras, &pictures, stride, stamps));
+        let targets = Targets { cameras, pictures, purposes, stride, key, values: Vec::new() };
+        targets.filled(PHOTOGRAPHS_NAME, scene, |picture| {
             // A view from a new camera has no photograph.
-            let camera = *rank_of_camera.get(picture.camera as usize)?;
+            let camera = *used.get(picture.camera as usize)?;
             let picture = FrameView { camera, ..picture };
             photographs
                 .has(picture)
@@ -173,12 +175,11 @@ impl Targets {
         })
     }
 
-    /// Returns these target views with their color values in a scratch file, under `name` and `key` in the cache. A view
-    /// shows the image that `photograph` returns for it, or, if this is `None`, a render of the original.
+    /// Returns these target views with their color values in a scratch file, under `name` and their key in the cache. A
+    /// view shows the image that `photograph` returns for it, or, if this is `None`, a render of the original.
     fn filled(
         mut self,
         name: &'static str,
-        key: CacheKey,
         scene: &Scene,
         photograph: impl Fn(FrameView) -> Option<Result<Image>> + Sync,
     ) -> Result<Targets> {
@@ -208,11 +209,11 @@ impl Targets {
                 },
             )
         };
-        self.values = scene.work.spill_in_shards(name, key, self.pictures.len(), &scene.scratch, make)?;
+        self.values = scene.work.spill_in_shards(name, self.key, self.pictures.len(), &scene.scratch, make)?;
         Ok(self)
     }
 
-    /// Returns the stride n of the training views: only every n-th column and row of pixels was rendered.
+    /// Returns the stride n of the training views: only every n-th column and row of pixels is stored.
     pub(crate) fn stride(&self) -> NonZeroU32 {
         self.stride
     }
@@ -334,10 +335,8 @@ pub(crate) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
 fn sampled(image: &Image, grid: PixelGrid) -> Image {
     let [width, height] = grid.size([image.width, image.height]);
     let row = |y: u32| (0..width).map(move |x| [grid.pixel(0, x), grid.pixel(1, y)]);
-    let color = |[x, y]: [u32; 2]| {
-        let at = 3 * (y as usize * image.width as usize + x as usize);
-        image.data[at..at + 3].to_vec()
-    };
+    let colors = image.data.as_chunks::<3>().0;
+    let color = |[x, y]: [u32; 2]| colors[y as usize * image.width as usize + x as usize];
     Image { width, height, data: (0..height).flat_map(row).flat_map(color).collect() }
 }
 
@@ -363,6 +362,24 @@ mod tests {
         assert!(back.iter().zip(&picture.data).all(|(a, b)| (a - b).abs() < 1e-5), "{back:?}");
         let odd = Image { data: vec![-3.0, f32::NAN, 7.0], ..picture };
         assert_eq!(narrow(&odd), [0, 0, u16::MAX]);
+    }
+
+    #[test]
+    fn sampled_pixels_are_those_of_the_grid() {
+        let [width, height] = [7u32, 5];
+        let value = |x: u32, y: u32, channel: u32| (100 * y + 10 * x + channel) as f32;
+        let colors = (0..height).flat_map(|y| (0..width).flat_map(move |x| (0..3).map(move |c| value(x, y, c))));
+        let image = Image { width, height, data: colors.collect() };
+        let grid = PixelGrid::new(NonZeroU32::new(3).unwrap(), [2, 1]);
+        let found = sampled(&image, grid);
+        assert_eq!([found.width, found.height], grid.size([width, height]));
+        for y in 0..found.height {
+            for x in 0..found.width {
+                let at = 3 * (y * found.width + x) as usize;
+                let expected = [0, 1, 2].map(|channel| value(grid.pixel(0, x), grid.pixel(1, y), channel));
+                assert_eq!(found.data[at..at + 3], expected);
+            }
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use hashbrown::HashMap;
 
 use super::work::stamps;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::image::read_png;
+use crate::files::image::{measure, read_png};
 use crate::model::{Camera, FrameView, Rig};
 use crate::render::Image;
 
@@ -99,6 +99,29 @@ impl Photographs {
             }
         }
         Ok(files)
+    }
+
+    /// Checks that the photographs of the views `pictures` can be read and have the sizes of their cameras. Reads the
+    /// first file whole, and only the start of the others. The camera indices of the views refer to `cameras`.
+    ///
+    /// # Errors
+    /// Fails if the first file is not a PNG, or if a file is not an image of its camera's size.
+    pub fn check_files(&self, pictures: &[FrameView], cameras: &[Camera]) -> Result<()> {
+        if let Some(&first) = pictures.first() {
+            self.read(first, &cameras[first.camera as usize], [0.0; 3])?;
+        }
+        for picture in pictures {
+            let Some(file) = self.files.get(&(picture.frame, picture.view)) else { continue };
+            let camera = &cameras[picture.camera as usize];
+            let expected = format!("a PNG of {}x{} pixels, the size of the camera", camera.width, camera.height);
+            let found = match measure(file) {
+                Some(size) if size == (camera.width, camera.height) => continue,
+                Some((width, height)) => format!("{width}x{height} pixels"),
+                None => "no image".to_owned(),
+            };
+            return Err(Error::input(file, view_name(*picture), expected, found));
+        }
+        Ok(())
     }
 
     /// Reads the photograph of the view `picture`, taken by `camera`. Transparent pixels are blended with `background`.

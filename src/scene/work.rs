@@ -59,13 +59,15 @@ impl Scene {
 /// Fails if a file or the cache folder cannot be read.
 pub fn open_cache(options: &InputOptions, input: &dyn InputModel) -> Result<(Cache, Option<String>)> {
     let Some(asked) = &options.work else { return Ok((Cache::disabled(), None)) };
-    let instructions = render::instruction_set();
+    // The C library's mathematical functions differ in the last bits.
+    let libc = if cfg!(target_env = "musl") { ", musl" } else { "" };
+    let instructions = format!("{}{libc}", render::instruction_set());
     let mut work = Cache::open(asked, format!("{} ({TOOL}, {instructions})", options.path.shown()))?;
     let digest = cached_digest(&work, options, input)?;
     // The key stands for this program, the machine's instruction set, and the content of the input as it was opened;
     // not for its path.
     let info = input.source().info();
-    work.depend_on(CacheKey::new(&(TOOL, instructions, &digest)).extended_by(&(
+    work.depend_on(CacheKey::new(&(TOOL, &instructions, &digest)).extended_by(&(
         info.count,
         &info.times,
         info.sh_degree,

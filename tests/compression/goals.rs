@@ -103,9 +103,9 @@ fn contradictory_targets_are_refused() {
     for (arguments, part) in [
         ("--max-loss 0.5", "--ground-truth"),
         ("--ground-truth {tiny}", "--max-loss"),
-        ("--toward photographs", "ground_truth"),
-        ("--toward renders --ground-truth {tiny}", "ground_truth"),
-        ("--toward photographs --ground-truth {tiny} --min-psnr 35", "min_psnr"),
+        ("--toward photographs", "--ground-truth"),
+        ("--toward renders --ground-truth {tiny}", "--toward photographs"),
+        ("--toward photographs --ground-truth {tiny} --min-psnr 35", "--min-psnr"),
         ("--min-psnr 35 --ratio 0.5", "--ratio"),
         ("--min-psnr 35 --size 5MB", "--size"),
         ("--min-psnr many", "decibels"),
@@ -116,6 +116,8 @@ fn contradictory_targets_are_refused() {
     }
     let none = "compress {tiny} --cameras {tiny} -o out --max-loss 1 --ground-truth {tiny}";
     workplace.refused(1, none, &["t000_v02.png", "no such file"]);
+    let none = "compress {tiny} --cameras {tiny} -o out --ratio 0.5 --toward photographs --ground-truth {tiny}";
+    workplace.refused(1, none, &[".png", "no such file"]);
 }
 
 #[test]

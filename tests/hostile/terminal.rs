@@ -160,7 +160,7 @@ fn slow_every_command_survives_broken_streams() {
     let commands = [
         format!("compress {{tiny}} --cameras {{tiny}} {SHORT} -o out --overwrite --explain"),
         format!("compress {{tiny}} --cameras {{tiny}} {SHORT} -o out --overwrite --json"),
-        "compress {tiny} --cameras {tiny} --list-stages -o out --overwrite".to_owned(),
+        "compress {tiny} --cameras {tiny} --dry-run=stages -o out --overwrite".to_owned(),
         "score {tiny} --cameras {tiny} -o out.csv --overwrite".to_owned(),
         "render {tiny} --cameras {tiny} --view 0 --frame 0 -o out.png --overwrite".to_owned(),
         "render {tiny} --cameras {tiny} --view 0 --video out.gif --overwrite".to_owned(),

@@ -169,6 +169,15 @@ impl From<LinkArg> for LinkMode {
     }
 }
 
+/// What a dry run prints.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum DryRun {
+    /// Plan, time and memory
+    Plan,
+    /// Stages that --shard divides, in order, with their units
+    Stages,
+}
+
 /// Images to which refinement fits the Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum FitTargetArg {

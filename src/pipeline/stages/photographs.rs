@@ -3,13 +3,16 @@
 
 use std::path::PathBuf;
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::memory_plan::ResourceEstimate;
+use crate::model::FrameView;
 use crate::pipeline::planning::Planning;
+use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::refinement::RefineStage;
-use crate::refinement::photographs::{FIT, NAME};
+use crate::refinement::photographs::FIT;
 use crate::scene::Scene;
+use crate::scene::view_selection::{ViewSet, select_views};
 
 /// Stage that fits the Gaussians to photographs.
 #[derive(Debug, Clone)]
@@ -18,6 +21,8 @@ struct PhotographStage {
     refine: RefineStage,
     /// Folder of the photographs.
     folder: PathBuf,
+    /// Whether the run searches for a maximum loss against the photographs of test views.
+    is_searched: bool,
 }
 
 /// Adds the stage to `stages` if the request names photographs and the run refines. If it does not refine, records this
@@ -28,23 +33,28 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
         (Some(_), None) => stages.leave_out(FIT, "the run does not refine"),
         (Some(folder), Some(refine)) => {
             let refine = refine.clone().without_prune_steps();
-            stages.add(Phase::Reduce, PhotographStage { refine, folder: folder.clone() });
+            let is_searched = matches!(planning.request.goal, Some(Goal::Quality(_)));
+            stages.add(Phase::Reduce, PhotographStage { refine, folder: folder.clone(), is_searched });
         }
     }
 }
 
 impl Stage for PhotographStage {
     fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![ResourceEstimate { stage: NAME, ..self.refine.resource_estimate(work, limits) }]
+        vec![self.refine.photographs_estimate(work, limits)]
     }
 
     fn parameters(&self) -> String {
         let RefineStage { steps, pictures, .. } = self.refine;
-        format!("photographs: {steps} steps toward {pictures} views, of which at most half are photographs")
+        format!("photographs: {steps} steps toward {pictures} views, of which about three quarters are photographs")
     }
 
     fn check(&self, scene: &Scene) -> Result<()> {
-        self.refine.find_photographs(scene, &self.folder).map(|_| ())
+        let (seen, photographs) = self.refine.find_photographs(scene, &self.folder)?;
+        if self.is_searched {
+            check_test_views_are_apart(scene, &seen)?;
+        }
+        photographs.check_files(&seen, &scene.schedule.cameras)
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -57,5 +67,24 @@ impl Stage for PhotographStage {
         run.result =
             self.refine.fit_to_photographs(run.scene, &scored, (seen, &photographs), start, &mut run.journal)?;
         Ok(())
+    }
+}
+
+/// Checks that the test views, on whose photographs the loss is measured, are not among the views `seen`, to whose
+/// photographs the result is fitted.
+///
+/// # Errors
+/// Fails if there are no test or validation views, or if one of them is among `seen`.
+fn check_test_views_are_apart(scene: &Scene, seen: &[FrameView]) -> Result<()> {
+    let test = match scene.rig.held_out_split() {
+        Some(_) => select_views(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?,
+        None => seen.to_vec(),
+    };
+    match test.iter().any(|view| seen.contains(view)) {
+        false => Ok(()),
+        true => Err(Error::usage(
+            "--max-loss measures photographs of test views, and --toward photographs would fit to the same ones: expected \
+             cameras with a test split, and --split train",
+        )),
     }
 }

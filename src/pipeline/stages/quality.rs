@@ -134,7 +134,7 @@ impl QualityStage {
         let times = &scene.source().info().times;
         let kind = match scene.rig.held_out_split() {
             Some(_) => ViewKind::Test,
-            // The PSNR of the validation views is that before a fit to photographs.
+            // After a fit to photographs, the PSNR of validation views in the journal is that of the model before it.
             None if journal.refined.is_some() && journal.photographs.is_none() => ViewKind::Validation,
             None if scene.has_cameras => ViewKind::Training,
             None => ViewKind::Virtual,
