@@ -36,6 +36,12 @@ pub enum FitTarget {
     Photographs,
 }
 
+impl FitTarget {
+    fn is_renders(&self) -> bool {
+        *self == FitTarget::Renders
+    }
+}
+
 /// Options of a run that affect the result, except the parameters of the recipe. A field is `None` if the user did not
 /// give the option.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -57,6 +63,7 @@ pub struct RunOptions {
     /// file.
     pub ground_truth: Option<PathBuf>,
     /// Images to which the result is fitted.
+    #[serde(skip_serializing_if = "FitTarget::is_renders")]
     pub toward: FitTarget,
     /// Maximum number of bytes of all output files together.
     pub target_size: Option<u64>,

@@ -109,7 +109,7 @@ class Cluster:
         key = self.folder / "munge.key"
         key.write_bytes(os.urandom(128))
         key.chmod(0o400)
-        munged = ["munged", "--foreground", "--overwrite", f"--key-file={key}", f"--socket={self.folder}/munge.socket"]
+        munged = ["munged", "--foreground", "--force", f"--key-file={key}", f"--socket={self.folder}/munge.socket"]
         munged += [f"--{what}-file={self.folder}/munge.{what}" for what in ("pid", "log", "seed")]
         self.daemon("munged", munged)
         wait("munged", 10, (self.folder / "munge.socket").exists)
