@@ -117,7 +117,8 @@ class Cluster:
         for name in self.names:
             self.node(name)
         states = ["sinfo", "-h", "-N", "-p", "all", "-o", "%T"]
-        wait("the nodes", 40, lambda: self.run(*states).split() == ["idle"] * len(self.names))
+        # The controller may not accept connections yet.
+        wait("the nodes", 40, lambda: self.run(*states, check=False).stdout.split() == ["idle"] * len(self.names))
 
     def node(self, name):
         """Starts the daemon of a node."""
