@@ -146,12 +146,13 @@ impl Targets {
         cameras_with_photographs.sort_unstable();
         cameras_with_photographs.dedup();
         let by_camera = cameras_with_photographs.len() >= VALIDATION_CAMERA_EVERY;
-        let is_validation = |(k, picture): &(usize, &FrameView)| {
-            let place = match by_camera {
-                true => cameras_with_photographs.binary_search(&picture.camera).unwrap_or_default(),
-                false => *k,
-            };
-            place % VALIDATION_CAMERA_EVERY == VALIDATION_CAMERA_EVERY / 2
+        let is_validation = |(k, picture): &(usize, &FrameView)| match by_camera {
+            true => {
+                let camera = cameras_with_photographs.binary_search(&picture.camera).unwrap_or_default();
+                camera % VALIDATION_CAMERA_EVERY == VALIDATION_CAMERA_EVERY / 2
+            }
+            // Another place in every group of photographs, so that all cameras of a small rig take part.
+            false => k % VALIDATION_CAMERA_EVERY == k / VALIDATION_CAMERA_EVERY % VALIDATION_CAMERA_EVERY,
         };
         let frame_and_view = |picture: &FrameView| (picture.frame, picture.view);
         let validation: HashSet<(usize, u32)> =
