@@ -17,10 +17,11 @@ target=$(rustc -vV | sed -n 's/^host: //p')
 if cargo zigbuild --help >/dev/null 2>&1; then
     target=${target%%-*}-unknown-linux-musl
     cargo zigbuild --release --target "$target"
+    program=${CARGO_TARGET_DIR:-target}/$target/release/splatsieve
 else
-    cargo build --release --target "$target"
+    cargo build --release
+    program=${CARGO_TARGET_DIR:-target}/release/splatsieve
 fi
-program=${CARGO_TARGET_DIR:-target}/$target/release/splatsieve
 version=$(cargo pkgid | sed 's/.*[#@]//')
 name=splatsieve-$target-v$version
 work=$(mktemp -d)

@@ -139,8 +139,8 @@ class Installed(unittest.TestCase):
         verbs = re.findall(r"^  ([\w-]+) {2,}", help().partition("\nOptions:")[0], re.M)
         self.assertIn("compress", verbs)
         options = "".join(help(verb) for verb in verbs if verb != "help")
-        # A name is followed by its value, or after two blanks by its description.
-        found = set(re.findall(r"^ {2,6}(?:-\w, )?--([\w-]+)(?:$| {2,}\S)", options, re.M))
+        # A name is followed by its value, by an optional value in brackets, or after two blanks by its description.
+        found = set(re.findall(r"^ {2,6}(?:-\w, )?--([\w-]+)(?:$|\[| {2,}\S)", options, re.M))
         self.assertEqual({name.replace("-", "_") for name in found} - {"help", "version"}, set(_program.SWITCHES))
 
     def test_options_become_command_line_words(self):

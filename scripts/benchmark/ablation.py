@@ -57,8 +57,8 @@ def stages(kept):
 
 
 def main():
-    kept = ("--kept", {"type": words, "default": KEPT, "help": "fractions of the Gaussians to keep"})
-    kinds = ("--kinds", {"type": words, "default": ["stage", "setting"], "help": "kinds of rows to measure"})
+    kept = ("--kept", {"type": words, "default": KEPT, "help": "fractions of the Gaussians to keep, separated by commas"})
+    kinds = ("--kinds", {"type": words, "default": ["stage", "setting"], "help": "kinds of rows to measure, separated by commas"})
     args = arguments(__doc__, kept, kinds)
     columns = ["model", "kept", "kind", "setting", "gaussians", "bytes", "psnr_db", "ssim"]
     results = Results("ablation", args.program, columns)

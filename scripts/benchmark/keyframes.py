@@ -17,7 +17,7 @@ from measuring import Results, arguments, chosen, compress, evaluate, run, words
 
 
 def main():
-    kept = {"type": words, "default": ["20%", "5%"], "help": "fractions of the Gaussians to keep"}
+    kept = {"type": words, "default": ["20%", "5%"], "help": "fractions of the Gaussians to keep, separated by commas"}
     args = arguments(__doc__, ("--kept", kept))
     columns = ["model", "kept", "keyframes", "bytes", "processor_s", "psnr_db", "ssim", "temporal"]
     results = Results("keyframes", args.program, columns)

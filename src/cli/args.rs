@@ -201,7 +201,7 @@ pub(super) struct OutputSize {
     /// and gives the reported value.
     #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER")]
     pub(super) ground_truth: Option<PathBuf>,
-    /// Images to fit the Gaussians to: photographs needs --ground-truth [default: renders, those of the original]
+    /// Images to fit the Gaussians to: renders of the original, or photographs in --ground-truth [default: renders]
     ///
     /// With photographs, a second fit follows the one to renders. It is kept if it raises the PSNR against photographs
     /// of cameras that are held back from it. It takes about as long as the first one.

@@ -68,6 +68,9 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     let (json, dry_run) = (args.json, args.dry_run);
     let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Brief };
     let page_output = args.view.clone();
+    if dry_run == Some(DryRun::Stages) && args.kept.shard.is_some() {
+        return Err(Error::usage("--dry-run=stages lists what --shard divides: expected only one of them"));
+    }
     let request = compress_options(args, quiet, events)?;
     match dry_run {
         None => (),

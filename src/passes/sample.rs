@@ -77,10 +77,7 @@ impl ViewSampler {
 pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
     let left = ViewSampler::new(scan).thin(schedule);
     if scan.look_pictures == 0 || left.pair_count() <= scan.look_pictures {
-        let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<FrameView> {
-            views.iter().map(|&(view, camera)| FrameView { frame, view, camera }).collect()
-        };
-        return left.iter().enumerate().flat_map(of_frame).collect();
+        return left.frame_views().collect();
     }
     select_evenly_over_frames(&left, scan.look_pictures, frames)
 }

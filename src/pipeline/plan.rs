@@ -303,7 +303,8 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     match (goal, &request.photographs) {
         (Some(Goal::Quality(Quality::Psnr(_))), Some(_)) => {
             return Err(Error::usage(
-                "a minimum PSNR against the original cannot be combined with a fit to photographs",
+                "--min-psnr compares with renders of the original, so it cannot be combined with --toward photographs: \
+                 expected --max-loss, --count, --ratio or --size, or --toward renders",
             ));
         }
         (Some(Goal::Quality(Quality::Loss { photographs, .. })), Some(fitted)) if fitted != photographs => {

@@ -131,18 +131,12 @@ impl RunOptions {
     /// - there are several goals, or both a goal and a target number of Gaussians;
     /// - `max_loss` or `toward = "photographs"` is given without `ground_truth` (folder of photographs), or
     ///   `ground_truth` without both;
-    /// - `min_psnr`, which compares with renders of the original, is given with `toward = "photographs"`;
     /// - a value in decibels is out of range.
     pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
         let fits_photographs = self.toward == FitTarget::Photographs;
         if self.ground_truth.is_some() != (self.max_loss.is_some() || fits_photographs) {
             return Err("expected --ground-truth, a folder of photographs, together with --max-loss or --toward \
                         photographs, and only with these"
-                .to_owned());
-        }
-        if fits_photographs && self.min_psnr.is_some() {
-            return Err("--min-psnr compares with renders of the original, so it cannot be combined with --toward \
-                        photographs: expected --max-loss, --count, --ratio or --size, or --toward renders"
                 .to_owned());
         }
         let photographs = self.ground_truth.as_ref().filter(|_| self.max_loss.is_some());

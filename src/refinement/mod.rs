@@ -44,6 +44,9 @@ use loss::Loss;
 /// Name of the refinement stage in messages and in the cache.
 const NAME: &str = "refine";
 
+/// Beginning of the reason that is recorded if refinement was omitted because it did not improve the validation PSNR.
+const NO_GAIN: &str = "it did not improve the validation PSNR";
+
 /// Time of one optimization step, divided by the time to render its view.
 const STEP_RENDERS: f64 = 3.0;
 

@@ -3,9 +3,9 @@
 
 use std::path::Path;
 
-use super::RefineStage;
 use super::run::RefineRun;
 use super::targets::{Targets, photograph_counts};
+use super::{NO_GAIN, RefineStage};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
@@ -17,53 +17,35 @@ use crate::passes::{VIEWS_PER_FRAME, select_evenly};
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
+use crate::scene::view_selection::distinct_views;
 
 /// Name of the stage in plans, progress and summaries.
 pub(crate) const NAME: &str = "photographs";
 /// Name of the fit in the list of omitted work.
 pub(crate) const FIT: &str = "refinement toward photographs";
-/// Minimum number of photographs with which the model is fitted to photographs.
+/// Minimum number of photographs of training views; with fewer, the run is refused.
 const MIN_PHOTOGRAPHS: usize = 8;
 /// Bytes of memory per pixel while a photograph is decoded: 16-bit RGBA, the same as floats, and the image.
 const DECODE_BYTES_PER_PIXEL: u64 = 36;
 
 impl RefineStage {
-    /// Returns the photographs in `folder` that the fit uses, for training or validation, and their views, spread over
-    /// frames and cameras and sorted by frame.
+    /// Returns the views whose photographs in `folder` are used, for fitting or for validation, and these photographs.
+    /// The views are spread over frames and cameras, and sorted by frame.
     ///
     /// # Errors
     /// Fails if the folder cannot be read, if it has photographs of fewer than [`MIN_PHOTOGRAPHS`] views, or if two
-    /// views of a frame have the same number.
+    /// cameras have the same view number at a frame.
     pub(crate) fn find_photographs(&self, scene: &Scene, folder: &Path) -> Result<(Vec<FrameView>, Photographs)> {
-        let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<FrameView> {
-            views.iter().map(|&(view, camera)| FrameView { frame, view, camera }).collect()
-        };
-        // Views from cameras outside the rig, which the program places, have no number.
-        let views: Vec<FrameView> = scene.schedule.iter().enumerate().flat_map(of_frame).collect();
-        let views: Vec<FrameView> = views.into_iter().filter(|view| view.view != u32::MAX).collect();
+        // Views from cameras that the program placed outside the rig have no number.
+        let numbered = scene.schedule.frame_views().filter(|view| view.view != u32::MAX);
+        let views = distinct_views(&scene.rig, numbered)?;
         let looked_for = views.len();
         let (found, photographs) = Photographs::find(folder, &scene.rig, &scene.source().info().times, views)?;
         if found.len() < MIN_PHOTOGRAPHS {
             let expected = format!("photographs of {MIN_PHOTOGRAPHS} or more of the {looked_for} training views");
             return Err(Error::input(folder, "", expected, format!("{} of them", found.len())));
         }
-        let mut schedule = ViewSchedule::new(scene.schedule.cameras.clone());
-        let mut left = found.as_slice();
-        for frame in 0..=found.last().map_or(0, |last| last.frame) {
-            let here;
-            (here, left) = left.split_at(left.partition_point(|view| view.frame == frame));
-            let mut pairs: Vec<(u32, u32)> = here.iter().map(|view| (view.view, view.camera)).collect();
-            pairs.sort_unstable();
-            if let Some(pair) = pairs.windows(2).find(|pair| pair[0].0 == pair[1].0 && pair[0].1 != pair[1].1) {
-                let number = pair[0].0;
-                return Err(Error::usage(format!(
-                    "--toward photographs: two cameras are view {number} at frame {frame}: expected different numbers\n  \
-                     choose one part with --split train"
-                )));
-            }
-            pairs.dedup();
-            schedule.push_frames(1, &pairs);
-        }
+        let schedule = ViewSchedule::from_views(scene.schedule.cameras.clone(), &found);
         let [count, _] = photograph_counts(self.pictures, scene.workload().pixels);
         Ok((select_evenly(&schedule, count, VIEWS_PER_FRAME), photographs))
     }
@@ -76,10 +58,13 @@ impl RefineStage {
         need
     }
 
-    /// Fits the model `reduction` to `photographs` of the views `seen`, and to renders of the original from new cameras.
-    /// Photographs of some cameras are held back for validation (see [`Targets::with_photographs`]): the result is the
-    /// state of the model with the highest PSNR against them, which may be `reduction` itself. Adds this PSNR before and
-    /// after the fit to `journal`, or the reason why nothing was changed.
+    /// Fits the model `reduction` to photographs and to renders of the original. The first target views are `seen`, views
+    /// from the scene's cameras, with their photographs in `photographs`; the others are renders from new cameras. Some
+    /// photographs are held back for validation (see [`Targets::with_photographs`]). Returns the state of the model with
+    /// the highest PSNR against these, which may be `reduction` itself.
+    ///
+    /// Records in `journal` the PSNR against these photographs before and after the fit. If the fit did not raise it,
+    /// records the reason instead.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if a scratch file cannot be written.
@@ -115,7 +100,7 @@ impl RefineStage {
                     let not_closer =
                         || format!("the {held_back} photographs that were held back did not become closer");
                     // Another reason, such as a PSNR that is not a number, is in the journal of the fit.
-                    let other = own.left_out.into_iter().find(|left| !left.why.contains("did not improve"));
+                    let other = own.left_out.into_iter().find(|left| !left.why.starts_with(NO_GAIN));
                     journal.leave_out(FIT, other.map_or_else(not_closer, |left| left.why));
                 }
             }

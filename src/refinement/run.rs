@@ -9,7 +9,7 @@ use super::optimizer::RateSchedule;
 use super::optimizer_state::{KeptCheckpoint, OptimizerState, keyframe_count};
 use super::survivors::survivors;
 use super::targets::{Targets, ViewSplit};
-use super::{MAX_USEFUL_PSNR, NAME, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
+use super::{MAX_USEFUL_PSNR, NAME, NO_GAIN, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
 use crate::cache::CacheKey;
 use crate::compressed_model::{CompressedModel, ParamDelta, TrajectoryDelta};
 use crate::error::Result;
@@ -515,7 +515,7 @@ impl<'a> RefineRun<'a> {
             journal.notes.push(format!("refinement: validation PSNR {start:.2} → {best:.2} dB ({count} views)"));
             journal.refined = Some(RefinedSummary { pictures: count, before: start, result: best });
         } else {
-            let why = format!("it did not improve the validation PSNR of {start:.2} dB ({count} views)");
+            let why = format!("{NO_GAIN} of {start:.2} dB ({count} views)");
             journal.leave_out("refinement", why);
         }
         if !best_state.trajectory.is_empty() {

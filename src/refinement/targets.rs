@@ -37,8 +37,8 @@ const VALIDATION_EVERY: [usize; 2] = [16, 8];
 /// Minimum number of target views at which one of every 16, instead of one of every 8, is a validation view.
 const MANY_VIEWS: usize = 400;
 
-/// Number n for photographs used for validation: one of every n cameras, or of every n photographs if there are fewer
-/// than n cameras, is used only for validation.
+/// Number n by which validation photographs are chosen: they are the photographs of one in n cameras. If fewer than n
+/// cameras have photographs, they are one in n photographs.
 const VALIDATION_CAMERA_EVERY: usize = 8;
 
 /// Number n for test views: one of every n target views is a test view. Only runs with a quality target have test
@@ -126,11 +126,14 @@ impl Targets {
         targets.filled(NAME, scene, |_| None)
     }
 
-    /// Stores target views of which the views `seen`, from the scene's cameras, show their photographs. The others are
-    /// renders of the original from new cameras, which keep the result from overfitting the photographs; their number is
-    /// in a fixed ratio to that of the photographs. The validation views are the photographs of one of every eight
-    /// cameras (of fewer than eight cameras, one of every eight photographs); all other views are training views. Of
-    /// these only every `stride`-th column and row of pixels is stored.
+    /// Creates target views of two kinds and stores their pixels in a scratch file:
+    /// - the views `seen` from the scene's cameras, which show photographs of the scene;
+    /// - new cameras, which show renders of the original and keep the result from overfitting the photographs. Their
+    ///   number is in a fixed ratio to the number of photographs.
+    ///
+    /// The photographs of one in eight cameras are validation views. If fewer than eight cameras have photographs, one
+    /// in eight photographs is a validation view. All other views are training views; of these only every `stride`-th
+    /// column and row of pixels is stored.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the scratch file cannot be written.
@@ -291,8 +294,8 @@ pub(super) fn validation_every(views: usize) -> usize {
     VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
 }
 
-/// Returns the purpose of target view `k` of `count`, if all of them show renders. If `has_test_views`, every fourth view
-/// is a test view.
+/// Returns the purpose of the target view with the index `k` among `count` target views, all of which show renders. If
+/// `has_test_views` is set, one in four views is used for testing.
 fn purpose(k: usize, count: usize, has_test_views: bool) -> Purpose {
     match () {
         () if has_test_views && k % TEST_EVERY == TEST_EVERY - 1 => Purpose::Test,

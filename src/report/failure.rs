@@ -38,8 +38,8 @@ pub const CROP_SIDE_PX: u32 = 64;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewErrorSums {
     /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`]: fast, thin, changing in appearance.
-    /// The share of a kind in a pixel is the sum of alpha · transmittance over the Gaussians of this kind. The squared
-    /// error of the pixel is added to the sums of each kind in proportion to its share.
+    /// The squared error of a pixel is divided among the kinds in proportion to their shares in the pixel. The share of a
+    /// kind is the sum of alpha · transmittance over its Gaussians.
     kinds: [FailureSums; 3],
     /// Sum over pixels of e²: the squared difference between the renders of the two models, averaged over color
     /// channels.

@@ -101,8 +101,8 @@ impl Photographs {
         Ok(files)
     }
 
-    /// Checks that the photographs of the views `pictures` can be read and have the sizes of their cameras. Reads the
-    /// first file whole, and only the start of the others. The camera indices of the views refer to `cameras`.
+    /// Checks that the photographs of the views `pictures` can be read and have the sizes of their cameras. Decodes only
+    /// the first photograph; of the others, reads only the image size. `cameras`: cameras of the views, by camera index.
     ///
     /// # Errors
     /// Fails if the first file is not a PNG, or if a file is not an image of its camera's size.

@@ -27,24 +27,29 @@ pub enum ViewSet {
 /// Fails if a view has a time that is not the time of any frame, if the split has no views, or if two cameras have the
 /// same frame and view number, which happens only if each split numbers its views on its own.
 pub fn select_views(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<FrameView>> {
-    let mut found = Vec::new();
-    for (frame, views) in rig.schedule(frame_times, part.split(rig))?.iter().enumerate() {
-        let mut views = views.to_vec();
-        views.sort_by_key(|&(view, _)| view);
-        // The files of training and test cameras may both list the same view.
-        views.dedup();
-        found.extend(views.into_iter().map(|(view, camera)| FrameView { frame, view, camera }));
-    }
-    if let Some(pair) = found.windows(2).find(|pair| (pair[0].frame, pair[0].view) == (pair[1].frame, pair[1].view)) {
-        return Err(Error::usage(format!(
-            "{}: two cameras are view {} at frame {}\n  choose one part with --split train or --split test",
-            rig.origin, pair[0].view, pair[0].frame
-        )));
-    }
+    let found = distinct_views(rig, rig.schedule(frame_times, part.split(rig))?.frame_views())?;
     if found.is_empty() {
         return Err(no_view_error(rig));
     }
     Ok(found)
+}
+
+/// Returns `views`, which are views of `rig`, ordered by frame, then view number, and each of them once.
+///
+/// # Errors
+/// Fails if two cameras have the same frame and view number.
+pub(crate) fn distinct_views(rig: &Rig, views: impl Iterator<Item = FrameView>) -> Result<Vec<FrameView>> {
+    let mut found: Vec<FrameView> = views.collect();
+    found.sort_by_key(|picture| (picture.frame, picture.view));
+    // The files of training and test cameras may both list the same view.
+    found.dedup();
+    match found.windows(2).find(|pair| (pair[0].frame, pair[0].view) == (pair[1].frame, pair[1].view)) {
+        None => Ok(found),
+        Some(pair) => Err(Error::usage(format!(
+            "{}: two cameras are view {} at frame {}\n  choose one part with --split train or --split test",
+            rig.origin, pair[0].view, pair[0].frame
+        ))),
+    }
 }
 
 /// Returns the error that the chosen split has no views. It names the splits of `rig` that have some.

@@ -173,7 +173,10 @@ fn every_table_on_the_benchmarks_page_has_a_file() {
     let mut before = "";
     for line in text.lines() {
         let begins = line.starts_with('|') && !before.starts_with('|');
-        assert!(!begins || before.ends_with("-->"), "no comment with the file above: {line}");
+        assert!(
+            !begins || before.ends_with("-->"),
+            "a table without a comment above it that names its CSV file: {line}"
+        );
         before = line;
     }
 }

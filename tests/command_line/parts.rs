@@ -332,6 +332,7 @@ fn divided_stages_are_listed_with_their_units() {
     assert!(lines[2].starts_with("rounds-01: ") && lines.contains(&"pairs: pairs of neighbors"), "{cached_shards}");
     assert_eq!(list("--preset paper"), "scan: 2 blocks of Gaussians\npairs: pairs of neighbors\n");
     assert!(list("").contains("targets: views"));
+    workplace.refused(2, "compress scene.gseq -o out.gseq --dry-run=stages --cache work --shard 1/2", &["--shard"]);
 }
 
 #[test]

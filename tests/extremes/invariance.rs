@@ -285,9 +285,9 @@ proptest! {
         prop_assert_eq!(found.keep, expected.keep);
     }
 
-    /// Checks that a change of the unit and the origin of time changes motion only by rounding. A time stamp is rounded
-    /// by 1e-16 of its distance from time 0, and a step between stamps by twice this. Steps may be as short as 1e-6 of
-    /// the duration, so their relative error is up to 1e-9.
+    /// Checks that a change of the unit and the origin of time changes motion only by rounding. Each time stamp is
+    /// rounded twice, by the sum with the origin and by the product with the unit, and a step has two stamps: its error
+    /// is at most four times 2^-53 of the stamp farthest from time 0. Steps may be as short as 2e-7 of the duration.
     #[test]
     fn time_units_change_motion_only_by_rounding_of_stamps(
         world in world(), unit in -12f64..12.0, start in -3f64..3.0,
@@ -295,9 +295,12 @@ proptest! {
         let mut other = world.clone();
         let span = (world.times[world.times.len() - 1] - world.times[0]).max(1.0);
         other.times.iter_mut().for_each(|time| *time = 10f64.powf(unit) * (*time + start * span));
+        let farthest = world.times.iter().map(|time| (time + start * span).abs()).fold(0.0, f64::max);
+        let shortest = world.times.windows(2).map(|pair| pair[1] - pair[0]).fold(span, f64::min);
+        let relative = 2.0 * f64::EPSILON * farthest / shortest + 1e-12;
         let (expected, found) = (world.measure(MotionParams::Runs), other.measure(MotionParams::Runs));
-        check_near("D", &found.rows.d, &expected.rows.d, 1e-9, 0.0)?;
-        check_near("kappa", &found.rows.kappa, &expected.rows.kappa, 1e-8, 1e-12 * expected.rows.d.iter().fold(0.0, |a: f64, b| a.max(*b)))?;
+        check_near("D", &found.rows.d, &expected.rows.d, relative, 0.0)?;
+        check_near("kappa", &found.rows.kappa, &expected.rows.kappa, 10.0 * relative, 1e-12 * expected.rows.d.iter().fold(0.0, |a: f64, b| a.max(*b)))?;
         prop_assert_eq!((found.rows.v, found.rows.life), (expected.rows.v, expected.rows.life));
         prop_assert_eq!((found.rows.c, found.rows.vis), (expected.rows.c, expected.rows.vis));
     }

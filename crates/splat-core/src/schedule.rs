@@ -53,6 +53,18 @@ impl ViewSchedule {
         ViewSchedule { cameras, ..ViewSchedule::default() }
     }
 
+    /// Creates a schedule with `cameras` and the views `views`, which must be sorted by frame. The last frame is that of
+    /// the last view.
+    pub fn from_views(cameras: Vec<Camera>, views: &[FrameView]) -> ViewSchedule {
+        let mut schedule = ViewSchedule::new(cameras);
+        for of_frame in views.chunk_by(|a, b| a.frame == b.frame) {
+            schedule.push_frames(of_frame[0].frame - schedule.frames, &[]);
+            let pairs: Vec<(u32, u32)> = of_frame.iter().map(|view| (view.view, view.camera)).collect();
+            schedule.push_frames(1, &pairs);
+        }
+        schedule
+    }
+
     /// Appends `count` frames that all have the views `views`: pairs (view number, camera index).
     pub fn push_frames(&mut self, count: usize, views: &[(u32, u32)]) {
         let extends_last_run = self.runs.last().is_some_and(|last| &self.views[last.view..] == views);
@@ -87,6 +99,13 @@ impl ViewSchedule {
     /// Iterates over the frames; yields the views of each as pairs (view number, camera index).
     pub fn iter(&self) -> impl Iterator<Item = &[(u32, u32)]> {
         (0..self.runs.len()).flat_map(|run| std::iter::repeat_n(self.views_of_run(run), self.run_length(run)))
+    }
+
+    /// Iterates over the views of all frames, in the order of the frames.
+    pub fn frame_views(&self) -> impl Iterator<Item = FrameView> {
+        self.iter()
+            .enumerate()
+            .flat_map(|(frame, views)| views.iter().map(move |&(view, camera)| FrameView { frame, view, camera }))
     }
 
     /// Returns the number M of (frame, view) pairs, which is the number of views summed over all frames.
