@@ -182,14 +182,30 @@ const ARRAYS: [WriteArray; 6] = [
             out.write_all(&smallest_three([x, -y, -z, w]).to_le_bytes())
         })
     },
-    |state, _, out| {
-        (0..state.len()).try_for_each(|row| {
-            (1..state.sh.width() / 3).zip(AXIS_SIGNS).try_for_each(|(k, sign)| {
-                out.write_all(&[0, 1, 2].map(|c| sh_byte(k, sign * state.sh.plane(3 * k + c)[row])))
-            })
-        })
-    },
+    write_sh,
 ];
+
+/// Writes the SH coefficients above degree 0 of the Gaussians `state` to `out`, one Gaussian after another, each with all
+/// its coefficients. `_unit` is not used; [`WriteArray`] requires it.
+fn write_sh(state: &Gaussians, _unit: f64, out: &mut dyn Write) -> std::io::Result<()> {
+    /// Number of Gaussians that are encoded at once, so that the bytes stay in the cache.
+    const BLOCK: usize = 1024;
+    let width = state.sh.width().saturating_sub(3);
+    if width == 0 {
+        return Ok(());
+    }
+    let mut bytes = vec![0; width * BLOCK];
+    for first in (0..state.len()).step_by(BLOCK) {
+        let rows = first..state.len().min(first + BLOCK);
+        for (column, sign) in AXIS_SIGNS.iter().flat_map(|sign| [sign; 3]).take(width).enumerate() {
+            let values = &state.sh.plane(3 + column)[rows.clone()];
+            let to = bytes[column..].iter_mut().step_by(width);
+            to.zip(values).for_each(|(to, value)| *to = sh_byte(1 + column / 3, sign * value));
+        }
+        out.write_all(&bytes[..width * rows.len()])?;
+    }
+    Ok(())
+}
 
 /// Returns the scale, in scene units, that `byte` stands for.
 fn scale_of_byte(byte: u8) -> f64 {
@@ -216,9 +232,10 @@ fn check_accuracy(state: &Gaussians, unit: f64) -> Result<SpzErrors> {
         if wanted.color.iter().any(|c| !c.is_finite()) {
             accuracy.add_sh(row, f64::INFINITY);
         }
-        for (k, c) in (1..state.sh.width() / 3).flat_map(|k| (0..3).map(move |c| (k, c))) {
-            let value = state.sh.plane(3 * k + c)[row];
-            let held = (f64::from(sh_byte(k, value)) - 128.0) / 128.0;
+    }
+    for column in 3..state.sh.width() {
+        for (row, &value) in state.sh.plane(column).iter().enumerate() {
+            let held = (f64::from(sh_byte(column / 3, value)) - 128.0) / 128.0;
             accuracy.add_sh(row, (f64::from(value) - held).abs());
         }
     }
@@ -250,11 +267,12 @@ fn scale_byte(log_scale: f32) -> u8 {
 /// Returns the byte that stores the SH coefficient `value` above degree 0. `k` is its index among the coefficients of
 /// one color channel, from 1. The number 128·`value` + 128 is rounded to 5 bits in degree 1 and to 4 bits above.
 fn sh_byte(k: usize, value: f32) -> u8 {
-    let step = if k < 4 { 8 } else { 16 };
+    let dropped_bits = if k < 4 { 3 } else { 4 };
     let scaled = 128.0 * f64::from(value);
     // The nearest integer; halves are rounded away from 0. Larger magnitudes than ±512 do not fit a byte anyway.
     let rounded = (scaled + 0.5f64.copysign(scaled)).clamp(-512.0, 512.0) as i32;
-    ((rounded + 128 + step / 2).div_euclid(step) * step).clamp(0, 255) as u8
+    let half = 1 << (dropped_bits - 1);
+    ((rounded + 128 + half) >> dropped_bits << dropped_bits).clamp(0, 255) as u8
 }
 
 /// Encodes a unit quaternion xyzw in 32 bits: the index of the component with the largest magnitude, and the values of

@@ -14,10 +14,14 @@
 //!
 //! Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the optical depth of the
 //! Gaussian is distributed among the curves, by multiplicative updates that keep all depths positive (Richardson 1972,
-//! Lucy 1974).
+//! Lucy 1974). The factors of the updates are raised to the power 1.5, which needs a third fewer of them.
+
+use std::ops::Range;
 
 use super::least_squares::polynomial;
+use super::windows::{Windows, window};
 use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
+use crate::model::exp_log::{exp, ln};
 
 /// Gaussian with cubic motion and linear rotation, visible in a window of time.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,30 +95,35 @@ impl CurveForm {
 
 /// Width of an overlapping window, divided by the distance between the centers of neighboring windows.
 const WIDTH_PER_INTERVAL: f64 = 0.75;
-/// Maximum number of iterations in [`overlapping_curves`], which distribute the optical depth −ln(1 − opacity) of a
-/// Gaussian among the curves that replace it.
+/// Maximum number of iterations in [`TrackFit::refine_depths`], which distribute the optical depth −ln(1 − opacity)
+/// of a Gaussian among the curves that replace it.
 const MAX_UPDATES: usize = 60;
-/// Tolerance of the iterations in [`overlapping_curves`], which distribute the optical depth −ln(1 − opacity) of a
-/// Gaussian among the curves that replace it. The iterations end once each curve meets one of two conditions:
+/// Tolerance of the iterations in [`TrackFit::refine_depths`]. The iterations end once each curve meets one of two
+/// conditions:
 /// - The last iteration changed the curve's optical depth by less than this fraction.
 /// - The curve's optical depth before the last iteration was below this value, so the curve is nearly invisible.
-const CONVERGED: f64 = 1e-3;
+///
+/// Depths start from this value or more.
+const CONVERGED: f64 = 2e-3;
 /// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Distance in time from the center of a window, in widths of the window, from which on the window counts as 0. Its true
-/// value there is exp(−36).
-const MAX_WIDTHS: f64 = 6.0;
 /// Limit that decides which frames the fit of a curve uses:
 /// - The fit of the opacities of overlapping curves uses frames at which the time window is above this value.
 /// - The fit of the motion uses frames whose weight (window × opacity) is above this value times
 ///   [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
 
+/// Number of iterations after which the first pass decides whether overlapping curves are hopeless.
+const FIRST_UPDATES: usize = 4;
+/// If overlapping curves have an error above this multiple of the tolerance after [`FIRST_UPDATES`] iterations, the first
+/// pass skips them. This is a heuristic: more iterations rarely reduce the error by this factor.
+const HOPELESS: f64 = 2.0;
+
 /// Returns curves of the form `form` that represent `track`, the states of a Gaussian at all frames. Tries increasing
-/// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame. If none do, returns
-/// the curves with the smallest error. Adds the errors of the returned curves to `misfit`.
+/// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame, without those that
+/// seem hopeless early ([`HOPELESS`]). If none do, returns the curves with the smallest error. Adds the errors of the returned curves to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,
@@ -123,246 +132,347 @@ pub fn fit_curves(
 ) -> Vec<CubicTrack> {
     let Some(first) = (0..track.len()).find(|&frame| track.is_visible(frame)) else { return Vec::new() };
     let last = (first..track.len()).rev().find(|&frame| track.is_visible(frame)).unwrap_or(first);
-    let mut best: Option<(f64, Vec<CubicTrack>, FitError)> = None;
-    let mut attempt = |curves: Vec<CubicTrack>| {
-        let (excess, found) = measure_misfit(track, &curves, tolerance);
-        if best.as_ref().is_none_or(|(least, _, _)| excess < *least) {
-            best = Some((excess, curves, found));
+    let mut fit = TrackFit::new(track, form, tolerance);
+    let span = [track.times[first], track.times[last]];
+    let is_wide = |count: usize| WIDTH_PER_INTERVAL * (span[1] - span[0]) / count as f64 >= form.min_width;
+    let max_intervals = form.max_intervals.min((last - first + 1).max(2));
+    let counts = || form.intervals().iter().take_while(|&&count| count <= max_intervals && is_wide(count));
+    // The first pass ends each attempt at the first sign that it fails. If every attempt fails, a second pass repeats
+    // the attempts to the end and keeps the curves with the smallest error.
+    for seeks_best in [false, true] {
+        fit.seeks_best = seeks_best;
+        let has_fit = fit.try_constant_curve()
+            || (form.has_linear_motion && fit.try_fading_curve())
+            || fit.try_single_window()
+            || counts().any(|&count| fit.try_overlapping_curves(span, count));
+        if has_fit {
+            break;
         }
-        excess <= 1.0
-    };
-    let mut done = attempt(vec![constant_curve(track, form)]);
-    let fading = if form.has_linear_motion { fading_curve(track, form) } else { None };
-    done = done || fading.is_some_and(|curve| attempt(vec![curve]));
-    done = done || attempt(vec![single_window_curve(track, form)]);
-    let visible = [track.times[first], track.times[last]];
-    let is_wide = |count: usize| WIDTH_PER_INTERVAL * (visible[1] - visible[0]) / count as f64 >= form.min_width;
-    for &count in form
-        .intervals()
-        .iter()
-        .take_while(|&&count| count <= form.max_intervals.min((last - first + 1).max(2)) && is_wide(count))
-    {
-        done = done || attempt(overlapping_curves(track, form, visible, count));
     }
-    let (_, curves, found) = best.unwrap_or_default();
+    let (_, curves, found) = fit.best;
     *misfit = misfit.merged_with(found);
     curves.into_iter().filter(|curve| curve.opacity >= MIN_VISIBLE_OPACITY).collect()
 }
 
-fn window(time: f64, center: f64, width: f64) -> f64 {
-    let widths = (time - center) / width;
-    if widths.abs() < MAX_WIDTHS { (-widths * widths).exp() } else { 0.0 }
-}
-
+/// Returns the optical depth of a Gaussian of opacity `opacity`.
 fn depth(opacity: f64) -> f64 {
-    -(-opacity.clamp(0.0, MAX_OPACITY)).ln_1p()
+    -ln(1.0 - opacity.clamp(0.0, MAX_OPACITY))
 }
 
-/// Returns one curve of the form `form` for `track` (states of a Gaussian at all frames), with an infinitely wide
-/// window. Its opacity is constant: the mean over the visible frames.
-fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
-    let center = track.times[0].midpoint(track.times[track.len() - 1]);
-    let seen = (0..track.len()).filter(|&frame| track.is_visible(frame));
-    let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
-    let curve = fit_motion(track, form, center, f64::INFINITY, |_| 1.0);
-    CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
-}
-
-/// Returns one curve of the form `form` for `track` (states of a Gaussian at all frames). The logarithm of its opacity
-/// is a parabola in time, fitted to the visible frames with the squared opacity as weight. The fit is exact if the
-/// opacity of `track` is a time window, even if only a part of the window lies within the sequence.
-///
-/// Returns `None` in these cases:
-/// - Fewer than three frames are visible.
-/// - The parabola does not open downward.
-/// - The opacity at the vertex of the parabola exceeds [`MAX_OPACITY`].
-/// - The vertex lies further outside the sequence than the sequence is long.
-fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
-    let (first, last) = (track.times[0], track.times[track.len() - 1]);
-    let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
-    let seen: Vec<usize> = (0..track.len()).filter(|&frame| track.is_visible(frame)).collect();
-    if seen.len() < 3 {
-        return None;
-    }
-    let samples = seen.iter().map(|&frame| {
-        let opacity = track.opacity[frame];
-        ((track.times[frame] - middle) / half, [opacity.ln()], opacity * opacity)
-    });
-    let [[a], [b], [c]] = polynomial(samples, 0.0);
-    let (vertex, peak) = (-b / (2.0 * c), (a - b * b / (4.0 * c)).exp());
-    let (center, width) = (middle + half * vertex, half * (-1.0 / c).sqrt());
-    let is_usable = c < 0.0 && vertex.abs() <= 3.0 && peak <= MAX_OPACITY && width.is_finite();
-    if !is_usable {
-        return None;
-    }
-    let width = width.max(form.min_width);
-    let curve = fit_motion(track, form, center, width, |frame| window(track.times[frame], center, width));
-    Some(CubicTrack { opacity: peak, ..curve })
-}
-
-/// Returns one curve of the form `form` for `track` (states of a Gaussian at all frames). Its time window has the same
-/// mean and the same variance over time as the opacity of the track.
-fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
-    let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
-        (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
-    };
-    let whole = moment(&|_| 1.0);
-    let center = moment(&|t| t) / whole;
-    let variance = moment(&|t| (t - center).powi(2)) / whole;
-    let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
-    // exp(−(dt/w)²) has the variance w²/2. Frames one step apart cannot resolve a width below half a step.
-    let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9).max(form.min_width);
-    let windows = |frame: usize| window(track.times[frame], center, width);
-    let (mut right, mut normal) = (0.0, 0.0);
-    for frame in 0..track.len() {
-        right += windows(frame) * track.opacity[frame];
-        normal += windows(frame).powi(2);
-    }
-    let curve = fit_motion(track, form, center, width, |frame| window(track.times[frame], center, width));
-    CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
-}
-
-/// Returns `count` + 1 overlapping curves of the form `form` for `track` (states of a Gaussian at all frames). The
-/// centers of their time windows are evenly spaced from the time `start` to the time `end`, between which the Gaussian
-/// is visible.
-fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
-    let apart = ((end - start) / count as f64).max(1e-9);
-    let width = WIDTH_PER_INTERVAL * apart;
-    let centers: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
-    let target_depths: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
-    // For each curve, the frames that affect it, each with the value of the curve's window.
-    let shares: Vec<Vec<(usize, f64)>> = centers
-        .iter()
-        .map(|&center| {
-            let share = |frame: usize| (frame, window(track.times[frame], center, width));
-            (0..track.len()).map(share).filter(|(_, share)| *share > MIN_WEIGHT).collect()
-        })
-        .collect();
-    let sums: Vec<f64> = shares.iter().map(|shares| shares.iter().map(|(_, share)| share).sum()).collect();
-    let most = target_depths.iter().copied().fold(0.0, f64::max);
-    let mut depths = vec![most / 2.0; centers.len()];
-    // For each frame: the product of the transmittances of all curves, then target depth divided by depth.
-    let mut ratios = vec![1.0; track.len()];
-    for _ in 0..MAX_UPDATES {
-        // A window multiplies the opacity, not the depth, so each curve adds the depth of its windowed opacity.
-        ratios.fill(1.0);
-        for (shares, d) in shares.iter().zip(&depths) {
-            let opacity = 1.0 - (-d).exp();
-            shares.iter().for_each(|&(frame, share)| ratios[frame] *= 1.0 - (opacity * share).min(MAX_OPACITY));
-        }
-        for (ratio, target) in ratios.iter_mut().zip(&target_depths) {
-            *ratio = target / (-ratio.ln()).max(1e-9);
-        }
-        let mut moved = 0.0f64;
-        for ((shares, sum), depth) in shares.iter().zip(&sums).zip(&mut depths) {
-            let weighted: f64 = shares.iter().map(|&(frame, share)| share * ratios[frame]).sum();
-            let by = if *sum > 0.0 { (weighted / sum).min(4.0) } else { 0.0 };
-            moved = moved.max((by - 1.0).abs().min(*depth));
-            *depth = (*depth * by).min(self::depth(MAX_OPACITY));
-        }
-        if moved < CONVERGED {
-            break;
-        }
-    }
-    let curve = |(k, depth): (usize, f64)| {
-        let curve = fit_motion(track, form, centers[k], width, |frame| window(track.times[frame], centers[k], width));
-        CubicTrack { opacity: 1.0 - (-depth).exp(), ..curve }
-    };
-    depths.into_iter().enumerate().map(curve).collect()
-}
-
-/// Returns a curve of the form `form` that follows the position and rotation of `track` (states of a Gaussian at all
-/// frames) by least squares. Its time window has the center `center` and the width `width`. The weight of a frame is
-/// its opacity times `weight(frame)`. Scales and SH coefficients are weighted means. The opacity of the curve is left
-/// at 0, for the caller to set.
-fn fit_motion(
-    track: &FittedTrack,
+/// Fit of curves to one track: values that every attempt uses, and the best curves so far.
+struct TrackFit<'a> {
+    track: &'a FittedTrack,
     form: CurveForm,
-    center: f64,
-    width: f64,
-    weight: impl Fn(usize) -> f64,
-) -> CubicTrack {
-    let weight = |frame: usize| if track.is_visible(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
-    let samples: Vec<(usize, f64)> = (0..track.len())
-        .map(|frame| (frame, weight(frame)))
-        .filter(|(_, weight)| *weight > MIN_WEIGHT * MIN_VISIBLE_OPACITY)
-        .collect();
-    let reach = samples.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
-    let scaled = |frame: usize| (track.times[frame] - center) / reach;
-    let positions = samples.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight));
-    let rotations = samples.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight));
-    let (position, rotation): ([[f64; 3]; 4], [[f64; 4]; 2]) = if form.has_linear_motion {
-        let [at, velocity] = polynomial(positions, RIDGE);
-        let [mean] = polynomial(rotations, RIDGE);
-        ([at, velocity, [0.0; 3], [0.0; 3]], [mean, [0.0; 4]])
-    } else {
-        (polynomial(positions, RIDGE), polynomial(rotations, RIDGE))
-    };
-    let whole: f64 = samples.iter().map(|&(_, weight)| weight).sum();
-    let mean = |value: &dyn Fn(usize) -> f64| {
-        samples.iter().map(|&(frame, weight)| weight * value(frame)).sum::<f64>() / whole.max(1e-300)
-    };
-    let unscaled = |k: usize| reach.powi(k as i32);
-    CubicTrack {
-        center,
-        width,
-        position: std::array::from_fn(|k| position[k].map(|value| value / unscaled(k))),
-        rotation: std::array::from_fn(|k| rotation[k].map(|value| value / unscaled(k))),
-        log_scale: std::array::from_fn(|c| mean(&|frame| track.log_scale[frame][c])),
-        opacity: 0.0,
-        sh: track.mean_sh(mean),
-    }
+    tolerance: &'a Tolerance,
+    /// For each frame, whether the Gaussian is visible ([`FittedTrack::is_visible`]).
+    visible: Vec<bool>,
+    /// For each frame, the optical depth of the Gaussian.
+    depths: Vec<f64>,
+    /// For each frame, the middle scale of the Gaussian ([`FittedTrack::middle_scale`]).
+    middle_scales: Vec<f64>,
+    /// Frames that the fit of a motion uses, with their times since the center of the window and their weights. Kept to
+    /// reuse the memory.
+    samples: Vec<(usize, f64, f64)>,
+    /// Time windows of the curves of the current attempt, in their order.
+    windows: Windows,
+    /// Whether the curves with the smallest error are kept even if they do not meet the tolerance. Set in the second
+    /// pass.
+    seeks_best: bool,
+    /// The curves with the smallest error so far: largest ratio of an error to its tolerance, curves, and errors.
+    best: (f64, Vec<CubicTrack>, FitError),
 }
 
-/// Compares `curves` with `track`, the states of a Gaussian, at all frames in which the Gaussian or a curve is visible.
-/// Returns two results:
-/// - The largest ratio of an error to its tolerance in `tolerance`. It is at most 1 if the curves meet the tolerance.
-///   Errors that are NaN are ignored. The errors of a curve are multiplied by the fraction of the Gaussian's optical
-///   depth that the curve has at the frame. So a curve that is hardly visible at a frame need not be close to the
-///   Gaussian there.
-/// - The errors over all these frames, in their own units.
-fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, FitError) {
-    let (mut worst, mut misfit) = (0.0f64, FitError::default());
-    for frame in 0..track.len() {
-        let time = track.times[frame];
-        let (mut shown, mut away) = (0.0, 0.0);
-        let weight = tolerance.weight(track.opacity[frame]);
-        let own_depth = depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY);
-        let middle_scale = track.middle_scale(frame);
-        for curve in curves {
-            let opacity = curve.opacity_at(time);
-            if opacity == 0.0 {
-                continue;
-            }
-            let share = depth(opacity);
-            shown += share;
-            if opacity < MIN_VISIBLE_OPACITY {
-                continue;
-            }
-            let dt = time - curve.center;
-            let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
-            let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
-            let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            let distance = track.distance(frame, curve.position_at(time)) / middle_scale;
-            away += share * distance;
-            worst = [
-                distance / tolerance.position,
-                track.rotation_error(frame, rotation) / tolerance.rotation,
-                scale / tolerance.log_scale,
-                f64::from(sh) / tolerance.sh,
-            ]
-            .into_iter()
-            // A curve that is hardly visible in this frame need not be as close.
-            .map(|excess| excess * weight * (share / own_depth).min(1.0))
-            .fold(worst, f64::max);
-        }
-        let apart = 1.0 - (-shown).exp() - track.opacity[frame];
-        if track.is_visible(frame) || apart > MIN_VISIBLE_OPACITY {
-            worst = worst.max(apart.abs() / tolerance.opacity);
-            misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
+impl<'a> TrackFit<'a> {
+    /// Returns a fit of curves of the form `form` to `track`, with no curves yet.
+    fn new(track: &'a FittedTrack, form: CurveForm, tolerance: &'a Tolerance) -> TrackFit<'a> {
+        TrackFit {
+            track,
+            form,
+            tolerance,
+            visible: (0..track.len()).map(|frame| track.is_visible(frame)).collect(),
+            depths: track.opacity.iter().map(|&opacity| depth(opacity)).collect(),
+            middle_scales: (0..track.len()).map(|frame| track.middle_scale(frame)).collect(),
+            samples: Vec::new(),
+            windows: Windows::default(),
+            seeks_best: false,
+            best: (f64::INFINITY, Vec::new(), FitError::default()),
         }
     }
-    (if worst.is_nan() { f64::INFINITY } else { worst }, misfit)
+
+    /// Measures the error of `curves`, whose time windows are in `self.windows`. Keeps the curves if they meet the
+    /// tolerance, or if `seeks_best` is set and they are the best so far. Returns whether they meet the tolerance.
+    fn keep_if_good(&mut self, curves: Vec<CubicTrack>) -> bool {
+        let limit = match (self.seeks_best, self.best.1.is_empty()) {
+            (false, _) => 1.0,
+            (true, true) => f64::INFINITY,
+            (true, false) => self.best.0.next_down(),
+        };
+        if let Some((excess, found)) = self.measure_misfit(&curves, limit) {
+            self.best = (excess, curves, found);
+        }
+        self.best.0 <= 1.0
+    }
+
+    /// Tries one curve with an infinitely wide window. Its opacity is constant: the mean over the visible frames. Returns
+    /// whether the curve meets the tolerance.
+    fn try_constant_curve(&mut self) -> bool {
+        let times = &self.track.times;
+        let center = times[0].midpoint(times[times.len() - 1]);
+        let seen = (0..times.len()).filter(|&frame| self.visible[frame]);
+        let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + self.track.opacity[frame], count + 1.0));
+        self.windows.clear();
+        self.windows.push(times, center, f64::INFINITY);
+        let curve = self.fit_motion(0, center, f64::INFINITY);
+        self.keep_if_good(vec![CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }])
+    }
+
+    /// Tries one curve. The logarithm of its opacity is a parabola in time, fitted to the visible frames with the squared
+    /// opacity as weight. Returns whether the curve meets the tolerance. The fit is exact if the opacity of the track is a time window, even if only a part of the
+    /// window lies within the sequence.
+    ///
+    /// Returns `false` without a curve in these cases:
+    /// - Fewer than three frames are visible.
+    /// - The parabola does not open downward.
+    /// - The opacity at the vertex of the parabola exceeds [`MAX_OPACITY`].
+    /// - The vertex lies further outside the sequence than the sequence is long.
+    fn try_fading_curve(&mut self) -> bool {
+        let track = self.track;
+        let (first, last) = (track.times[0], track.times[track.len() - 1]);
+        let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
+        let seen = || (0..track.len()).filter(|&frame| self.visible[frame]);
+        if seen().nth(2).is_none() {
+            return false;
+        }
+        let samples = seen().map(|frame| {
+            let opacity = track.opacity[frame];
+            ((track.times[frame] - middle) / half, [ln(opacity)], opacity * opacity)
+        });
+        let [[a], [b], [c]] = polynomial(samples, 0.0);
+        let (vertex, peak) = (-b / (2.0 * c), (a - b * b / (4.0 * c)).exp());
+        let (center, width) = (middle + half * vertex, half * (-1.0 / c).sqrt());
+        let is_usable = c < 0.0 && vertex.abs() <= 3.0 && peak <= MAX_OPACITY && width.is_finite();
+        if !is_usable {
+            return false;
+        }
+        let width = width.max(self.form.min_width);
+        self.windows.clear();
+        self.windows.push(&track.times, center, width);
+        let curve = self.fit_motion(0, center, width);
+        self.keep_if_good(vec![CubicTrack { opacity: peak, ..curve }])
+    }
+
+    /// Tries one curve whose time window has the same mean and the same variance over time as the opacity of the track.
+    /// Returns whether the curve meets the tolerance.
+    fn try_single_window(&mut self) -> bool {
+        let track = self.track;
+        let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
+            (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
+        };
+        let whole = moment(&|_| 1.0);
+        let center = moment(&|t| t) / whole;
+        let variance = moment(&|t| (t - center).powi(2)) / whole;
+        let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
+        // exp(−(dt/w)²) has the variance w²/2. Frames one step apart cannot resolve a width below half a step.
+        let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9).max(self.form.min_width);
+        self.windows.clear();
+        self.windows.push(&track.times, center, width);
+        let (frames, values) = self.windows.window(0);
+        let (mut right, mut normal) = (0.0, 0.0);
+        for (value, opacity) in values.iter().zip(&track.opacity[frames]) {
+            right += value * opacity;
+            normal += value.powi(2);
+        }
+        let curve = self.fit_motion(0, center, width);
+        self.keep_if_good(vec![CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }])
+    }
+
+    /// Tries `count` + 1 overlapping curves. The centers of their time windows are evenly spaced from the time `start`
+    /// to the time `end`, between which the Gaussian is visible. Returns whether the curves meet the tolerance.
+    fn try_overlapping_curves(&mut self, [start, end]: [f64; 2], count: usize) -> bool {
+        let apart = ((end - start) / count as f64).max(1e-9);
+        let width = WIDTH_PER_INTERVAL * apart;
+        let center = |k: usize| start + k as f64 * apart;
+        self.windows.clear();
+        (0..=count).for_each(|k| self.windows.push(&self.track.times, center(k), width));
+        let mut curves: Vec<CubicTrack> = (0..=count).map(|k| self.fit_motion(k, center(k), width)).collect();
+        let set_depths = |curves: &mut [CubicTrack], depths: &[f64]| {
+            curves.iter_mut().zip(depths).for_each(|(curve, depth)| curve.opacity = 1.0 - exp(-depth));
+        };
+        let mut depths = self.estimate_depths(count + 1);
+        if !self.seeks_best {
+            self.refine_depths(&mut depths, FIRST_UPDATES);
+            set_depths(&mut curves, &depths);
+            if self.measure_misfit(&curves, HOPELESS).is_none() {
+                return false;
+            }
+        }
+        self.refine_depths(&mut depths, MAX_UPDATES);
+        set_depths(&mut curves, &depths);
+        self.keep_if_good(curves)
+    }
+
+    /// Returns an estimate of the optical depth at the center of its window for each of `count` curves, whose windows
+    /// are in `self.windows`: the mean depth of the Gaussian under the window, divided by the sum of all windows at one
+    /// time.
+    fn estimate_depths(&self, count: usize) -> Vec<f64> {
+        // Evenly spaced windows add up to their integral divided by their distance.
+        let overlap = WIDTH_PER_INTERVAL * std::f64::consts::PI.sqrt();
+        let estimate = |k: usize| {
+            let (frames, values) = self.windows.window_above(k, MIN_WEIGHT);
+            let weighted: f64 = values.iter().zip(&self.depths[frames]).map(|(value, depth)| value * depth).sum();
+            let sum: f64 = values.iter().sum();
+            // Positive, as the updates multiply it.
+            if sum > 0.0 { (weighted / sum / overlap).max(CONVERGED) } else { 0.0 }
+        };
+        (0..count).map(estimate).collect()
+    }
+
+    /// Changes `depths`, the optical depth at the center of its window for each curve, so that the depths of all curves
+    /// add up to the depth of the Gaussian at every frame. The windows are in `self.windows`. Ends after `max_updates`
+    /// iterations at the latest.
+    fn refine_depths(&self, depths: &mut [f64], max_updates: usize) {
+        // Frames that each window affects, with the values of the window there and the sum of these values.
+        let shares: Vec<(Range<usize>, &[f64], f64)> = (0..depths.len())
+            .map(|k| {
+                let (frames, values) = self.windows.window_above(k, MIN_WEIGHT);
+                (frames, values, values.iter().sum())
+            })
+            .collect();
+        // For each frame: the product of the transmittances of all curves, then target depth divided by depth.
+        let mut ratios = vec![1.0; self.depths.len()];
+        for _ in 0..max_updates {
+            // A window multiplies the opacity, not the depth, so each curve adds the depth of its windowed opacity.
+            ratios.fill(1.0);
+            for ((frames, values, _), depth) in shares.iter().zip(depths.iter()) {
+                let opacity = 1.0 - exp(-depth);
+                let ratios = &mut ratios[frames.clone()];
+                ratios
+                    .iter_mut()
+                    .zip(*values)
+                    .for_each(|(ratio, value)| *ratio *= 1.0 - (opacity * value).min(MAX_OPACITY));
+            }
+            ratios.iter_mut().zip(&self.depths).for_each(|(ratio, target)| *ratio = target / (-ln(*ratio)).max(1e-9));
+            let mut moved = 0.0f64;
+            for ((frames, values, sum), depth) in shares.iter().zip(depths.iter_mut()) {
+                let weighted: f64 =
+                    values.iter().zip(&ratios[frames.clone()]).map(|(value, ratio)| value * ratio).sum();
+                let ratio = if *sum > 0.0 { (weighted / sum).min(4.0) } else { 0.0 };
+                let by = ratio * ratio.sqrt();
+                moved = moved.max((by - 1.0).abs().min(*depth));
+                *depth = (*depth * by).min(self::depth(MAX_OPACITY));
+            }
+            if moved < CONVERGED {
+                break;
+            }
+        }
+    }
+
+    /// Returns a curve that follows the position and rotation of the track by least squares. Its time window is window
+    /// `k` of `self.windows`, with the center `center` and the width `width`. The weight of a frame is its opacity times
+    /// the window. Scales and SH coefficients are weighted means. The opacity of the curve is left at 0, for the caller
+    /// to set.
+    fn fit_motion(&mut self, k: usize, center: f64, width: f64) -> CubicTrack {
+        let track = self.track;
+        let (frames, values) = self.windows.window(k);
+        self.samples.clear();
+        for (frame, value) in frames.zip(values) {
+            let weight = value * track.opacity[frame];
+            if self.visible[frame] && weight > MIN_WEIGHT * MIN_VISIBLE_OPACITY {
+                self.samples.push((frame, track.times[frame] - center, weight));
+            }
+        }
+        let samples = &self.samples;
+        let reach = samples.iter().map(|&(_, dt, _)| dt.abs()).fold(1e-9, f64::max);
+        let positions = samples.iter().map(|&(frame, dt, weight)| (dt / reach, track.position[frame], weight));
+        let rotations = samples.iter().map(|&(frame, dt, weight)| (dt / reach, track.rotation[frame], weight));
+        let (position, rotation): ([[f64; 3]; 4], [[f64; 4]; 2]) = if self.form.has_linear_motion {
+            let [at, velocity] = polynomial(positions, RIDGE);
+            let [mean] = polynomial(rotations, RIDGE);
+            ([at, velocity, [0.0; 3], [0.0; 3]], [mean, [0.0; 4]])
+        } else {
+            (polynomial(positions, RIDGE), polynomial(rotations, RIDGE))
+        };
+        let (mut whole, mut log_scale) = (0.0, [0.0; 3]);
+        for &(frame, _, weight) in samples {
+            whole += weight;
+            log_scale.iter_mut().zip(track.log_scale[frame]).for_each(|(sum, value)| *sum += weight * value);
+        }
+        let whole = f64::max(whole, 1e-300);
+        let mean = |value: &dyn Fn(usize) -> f64| {
+            samples.iter().map(|&(frame, _, weight)| weight * value(frame)).sum::<f64>() / whole
+        };
+        let unscaled = |k: usize| reach.powi(k as i32);
+        CubicTrack {
+            center,
+            width,
+            position: std::array::from_fn(|k| position[k].map(|value| value / unscaled(k))),
+            rotation: std::array::from_fn(|k| rotation[k].map(|value| value / unscaled(k))),
+            log_scale: log_scale.map(|sum| sum / whole),
+            opacity: 0.0,
+            sh: track.mean_sh(mean),
+        }
+    }
+
+    /// Compares `curves`, whose time windows are in `self.windows`, with the track at all frames in which the Gaussian
+    /// or a curve is visible. Returns two results, or `None` if the first is above `limit`:
+    /// - The largest ratio of an error to its tolerance. It is at most 1 if the curves meet the tolerance. Errors that
+    ///   are NaN are ignored. The errors of a curve are multiplied by the fraction of the Gaussian's optical depth that
+    ///   the curve has at the frame. So a curve that is hardly visible at a frame need not be close to the Gaussian
+    ///   there.
+    /// - The errors over all these frames, in their own units.
+    fn measure_misfit(&self, curves: &[CubicTrack], limit: f64) -> Option<(f64, FitError)> {
+        let (track, tolerance) = (self.track, self.tolerance);
+        let (mut worst, mut misfit) = (0.0f64, FitError::default());
+        for frame in 0..track.len() {
+            let (mut shown, mut away) = (0.0, 0.0);
+            let weight = tolerance.weight(track.opacity[frame]);
+            let own_depth = self.depths[frame].max(MIN_VISIBLE_OPACITY);
+            for (k, curve) in curves.iter().enumerate() {
+                let opacity = curve.opacity * self.windows.value(k, frame);
+                if opacity == 0.0 {
+                    continue;
+                }
+                let share = depth(opacity);
+                shown += share;
+                if opacity < MIN_VISIBLE_OPACITY {
+                    continue;
+                }
+                let distance = track.distance(frame, curve.position_at(track.times[frame])) / self.middle_scales[frame];
+                away += share * distance;
+                // A curve that is hardly visible in this frame need not be as close.
+                let factor = weight * (share / own_depth).min(1.0);
+                worst = worst.max(factor * (distance / tolerance.position));
+                worst = worst.max(self.excess_beyond_position(frame, curve, worst / factor) * factor);
+            }
+            let apart = 1.0 - exp(-shown) - track.opacity[frame];
+            if self.visible[frame] || apart > MIN_VISIBLE_OPACITY {
+                worst = worst.max(apart.abs() / tolerance.opacity);
+                misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
+            }
+            if worst > limit {
+                return None;
+            }
+        }
+        Some((worst, misfit))
+    }
+
+    /// Returns the largest ratio of an error to its tolerance at `frame` over scales, SH coefficients and rotation of
+    /// `curve`. The error of the rotation is left out if it is certainly below `ignored` times its tolerance.
+    fn excess_beyond_position(&self, frame: usize, curve: &CubicTrack, ignored: f64) -> f64 {
+        let (track, tolerance) = (self.track, self.tolerance);
+        let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
+        let mut excess = scale / tolerance.log_scale;
+        if !track.has_constant_sh() {
+            let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            excess = excess.max(f64::from(sh) / tolerance.sh);
+        }
+        let dt = track.times[frame] - curve.center;
+        let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
+        if track.max_rotation_error(frame, rotation) / tolerance.rotation >= ignored {
+            excess = excess.max(track.rotation_error(frame, rotation) / tolerance.rotation);
+        }
+        excess
+    }
 }
 
 #[cfg(test)]
@@ -406,6 +516,28 @@ mod tests {
         let half_seen = track(120, |_| [0.0; 3], |t| if t < 0.5 { 0.7 } else { 0.0 });
         let step = fit_curves(&half_seen, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!(step.len() > 2 && misfit.opacity < 0.4, "{} curves, {misfit:?}", step.len());
+    }
+
+    #[test]
+    fn early_rejection_does_not_reject_curves_that_fit() {
+        let tolerance = Tolerance::default();
+        for opacity in [0.1, 0.4, 0.5, 0.6, 0.8] {
+            let wave = track(120, |t| [0.3 * (18.0 * t).sin(), 0.0, 0.0], |_| opacity);
+            for form in [CurveForm::CUBIC, CurveForm::linear(0.02)] {
+                let found = fit_curves(&wave, form, &tolerance, &mut FitError::default());
+                let mut patient = TrackFit::new(&wave, form, &tolerance);
+                patient.seeks_best = true;
+                let span = [wave.times[0], wave.times[119]];
+                let expected = form.intervals().iter().find(|&&count| patient.try_overlapping_curves(span, count));
+                // Curves at the ends of the sequence may be too faint to be returned.
+                let counts = expected.map(|count| count - 1..=count + 1);
+                assert!(
+                    counts.is_none_or(|counts| counts.contains(&found.len())),
+                    "{opacity}: {} curves, {expected:?} intervals",
+                    found.len()
+                );
+            }
+        }
     }
 
     #[test]

@@ -1,26 +1,31 @@
 //! Weighted least squares fit of polynomials of low degree, in f64.
 
-/// Fits a polynomial Σ cₖ·uᵏ with `K` coefficients to each of the `C` components of `samples`. A sample is (u, y, w):
-/// argument, values of the components, and weight; u should be about within ±1. Returns the coefficients c₀ … that
-/// minimize Σ w·(y − Σ cₖ·uᵏ)² plus `ridge`·Σw·cₖ² for k ≥ 1. The ridge term, which is proportional to the total
-/// weight, keeps coefficients small that the samples do not determine. Returns zeros if the system cannot be solved.
+/// Fits a polynomial Σ cₖ·uᵏ with `K` coefficients, at most 4, to each of the `C` components of `samples`. A sample is
+/// (u, y, w): argument, values of the components, and weight; u should be about within ±1. Returns the coefficients
+/// c₀ … that minimize Σ w·(y − Σ cₖ·uᵏ)² plus `ridge`·Σw·cₖ² for k ≥ 1. The ridge term, which is proportional to the
+/// total weight, keeps coefficients small that the samples do not determine. Returns zeros if the system cannot be
+/// solved.
 pub(crate) fn polynomial<const K: usize, const C: usize>(
     samples: impl Iterator<Item = (f64, [f64; C], f64)>,
     ridge: f64,
 ) -> [[f64; C]; K] {
-    let mut normal = [[0.0; K]; K];
+    const { assert!(K <= 4) };
+    // Sums of w·uⁱ, which are the elements of the normal matrix.
+    let mut moments = [0.0; 7];
     let mut right = [[0.0; C]; K];
-    let mut whole = 0.0;
     for (u, y, w) in samples {
-        let powers: [f64; K] = std::array::from_fn(|k| u.powi(k as i32));
-        whole += w;
-        for i in 0..K {
-            normal[i].iter_mut().zip(powers).for_each(|(to, power)| *to += w * powers[i] * power);
-            right[i].iter_mut().zip(y).for_each(|(to, y)| *to += w * powers[i] * y);
+        let mut weighted_power = w;
+        for (i, moment) in moments[..2 * K - 1].iter_mut().enumerate() {
+            *moment += weighted_power;
+            if i < K {
+                right[i].iter_mut().zip(y).for_each(|(to, y)| *to += weighted_power * y);
+            }
+            weighted_power *= u;
         }
     }
+    let mut normal: [[f64; K]; K] = std::array::from_fn(|i| std::array::from_fn(|j| moments[i + j]));
     for (k, row) in normal.iter_mut().enumerate().skip(1) {
-        row[k] += ridge * whole + f64::MIN_POSITIVE;
+        row[k] += ridge * moments[0] + f64::MIN_POSITIVE;
     }
     // Gauss-Jordan elimination with pivots. The matrix is positive definite except for rounding errors.
     for k in 0..K {

@@ -8,6 +8,7 @@ mod curved;
 mod least_squares;
 mod straight;
 mod track;
+mod windows;
 
 pub use curved::{CubicTrack, CurveForm, fit_curves};
 pub(crate) use least_squares::polynomial;

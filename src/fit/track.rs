@@ -25,8 +25,9 @@ pub struct FittedTrack {
 
 impl FittedTrack {
     /// Returns the track (states at all frames) of the Gaussian in row `row` of `states`. `states` holds all Gaussians
-    /// at each of the `times`.
-    pub fn from_states(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
+    /// at each of the `times`. `has_varying_sh`: whether SH coefficients may differ between the
+    /// states; if not, only those of the first state are read.
+    pub fn from_states(times: &[f64], states: &[Gaussians], row: usize, has_varying_sh: bool) -> FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];
         for state in states {
@@ -41,6 +42,9 @@ impl FittedTrack {
             track.rotation.push(last);
             track.log_scale.push(state.log_scale.row::<3>(row).map(f64::from));
             track.opacity.push(opacity(state.opacity_logit.row::<1>(row)[0]));
+            if !has_varying_sh && !track.sh.is_empty() {
+                continue;
+            }
             let sh = || (0..state.sh.width()).map(|c| state.sh.plane(c)[row]);
             if !track.sh.last().is_some_and(|last| sh().eq(last.iter().copied())) {
                 track.sh.resize(track.position.len() - 1, track.sh.last().cloned().unwrap_or_default());
@@ -68,6 +72,11 @@ impl FittedTrack {
     pub fn is_visible(&self, frame: usize) -> bool {
         let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());
         self.opacity[frame] >= MIN_VISIBLE_OPACITY && finite(&self.position[frame]) && finite(&self.log_scale[frame])
+    }
+
+    /// Returns whether the SH coefficients are the same in all frames.
+    pub fn has_constant_sh(&self) -> bool {
+        self.sh.len() == 1
     }
 
     /// Returns the SH coefficients of the Gaussian at `frame`.
@@ -111,8 +120,21 @@ impl FittedTrack {
         if most - least < 0.1 {
             return 0.0;
         }
+        2.0 * self.half_angle_cosine(frame, rotation).acos()
+    }
+
+    /// Returns an upper bound, in radians, of [`FittedTrack::rotation_error`]. It is faster to compute, from
+    /// acos x ≤ π/2·√(1 − x) for 0 ≤ x ≤ 1.
+    pub fn max_rotation_error(&self, frame: usize, rotation: [f64; 4]) -> f64 {
+        // The factor 1 + 1e-9 covers rounding errors.
+        std::f64::consts::PI * (1.0 - self.half_angle_cosine(frame, rotation)).sqrt() * (1.0 + 1e-9)
+    }
+
+    /// Returns the cosine, at most 1, of half of the angle between `rotation` and the rotation of the Gaussian at
+    /// `frame`.
+    fn half_angle_cosine(&self, frame: usize, rotation: [f64; 4]) -> f64 {
         let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-300);
         let dot: f64 = rotation.iter().zip(self.rotation[frame]).map(|(a, b)| a * b).sum();
-        2.0 * (dot.abs() / length).min(1.0).acos()
+        (dot.abs() / length).min(1.0)
     }
 }

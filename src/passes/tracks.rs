@@ -37,7 +37,8 @@ pub fn map_tracks<R: Send>(
             states.push(state);
         }
         progress.advance((ids.len() * states.len()) as u64);
-        Ok((0..ids.len()).map(|row| make(&FittedTrack::from_states(times, &states, row))).collect())
+        let has_varying_sh = info.varying.contains(Attributes::SH);
+        Ok((0..ids.len()).map(|row| make(&FittedTrack::from_states(times, &states, row, has_varying_sh))).collect())
     };
     let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACKS_PER_BLOCK))
         .into_par_iter()

@@ -1,0 +1,89 @@
+//! Time windows exp(−((t − center)/width)²) of curves, with their values at the frames of a track.
+
+use std::ops::Range;
+
+use crate::model::exp_log::exp;
+
+/// Distance in time from the center of a window, in widths of the window, from which on the window counts as 0. Its true
+/// value there is exp(−36).
+const MAX_WIDTHS: f64 = 6.0;
+
+/// Returns the value at `time` of the window with the given center and width, which may be infinite.
+pub(super) fn window(time: f64, center: f64, width: f64) -> f64 {
+    let widths = (time - center) / width;
+    if widths.abs() < MAX_WIDTHS { exp(-widths * widths) } else { 0.0 }
+}
+
+/// Values of several windows at the frames of one track.
+#[derive(Default)]
+pub(super) struct Windows {
+    /// For each window, the frames at which it is not 0, and the index in `values` of its value at the first of them.
+    frames: Vec<(Range<usize>, usize)>,
+    /// Values of all windows at these frames, one window after the other.
+    values: Vec<f64>,
+}
+
+impl Windows {
+    /// Removes all windows.
+    pub(super) fn clear(&mut self) {
+        self.frames.clear();
+        self.values.clear();
+    }
+
+    /// Adds the window with the given center and width. `times` are the times of the frames, increasing.
+    pub(super) fn push(&mut self, times: &[f64], center: f64, width: f64) {
+        debug_assert!(times.is_sorted());
+        let first = times.partition_point(|time| (time - center) / width <= -MAX_WIDTHS);
+        let end = times.partition_point(|time| (time - center) / width < MAX_WIDTHS).max(first);
+        self.frames.push((first..end, self.values.len()));
+        self.values.extend(times[first..end].iter().map(|&time| {
+            let widths = (time - center) / width;
+            exp(-widths * widths)
+        }));
+    }
+
+    /// Returns the frames at which window `k` is not 0, and its values there.
+    pub(super) fn window(&self, k: usize) -> (Range<usize>, &[f64]) {
+        let (frames, start) = &self.frames[k];
+        (frames.clone(), &self.values[*start..start + frames.len()])
+    }
+
+    /// Returns the frames at which window `k` is above `limit`, and its values there.
+    pub(super) fn window_above(&self, k: usize, limit: f64) -> (Range<usize>, &[f64]) {
+        // A window has one maximum, so these frames are consecutive.
+        let (frames, values) = self.window(k);
+        let first = values.iter().position(|value| *value > limit).unwrap_or(0);
+        let end = values.iter().rposition(|value| *value > limit).map_or(first, |last| last + 1);
+        (frames.start + first..frames.start + end, &values[first..end])
+    }
+
+    /// Returns the value of window `k` at `frame`.
+    pub(super) fn value(&self, k: usize, frame: usize) -> f64 {
+        let (frames, start) = &self.frames[k];
+        if frames.contains(&frame) { self.values[start + frame - frames.start] } else { 0.0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stored_values_equal_the_window_at_every_frame() {
+        let times: Vec<f64> = (0..50).map(|frame| f64::from(frame) * 0.02).collect();
+        let mut windows = Windows::default();
+        let shapes = [(0.3, 0.05), (-0.1, 0.2), (0.5, f64::INFINITY), (3.0, 0.1), (0.41, 1e-9)];
+        for (center, width) in shapes {
+            windows.push(&times, center, width);
+        }
+        for (k, (center, width)) in shapes.into_iter().enumerate() {
+            for (frame, &time) in times.iter().enumerate() {
+                let expected = window(time, center, width);
+                assert_eq!(windows.value(k, frame), expected, "window {k}, frame {frame}");
+                let (frames, values) = windows.window_above(k, 0.1);
+                assert_eq!(frames.contains(&frame), expected > 0.1, "window {k}, frame {frame}");
+                assert!(!frames.contains(&frame) || values[frame - frames.start] == expected);
+            }
+        }
+    }
+}
