@@ -19,7 +19,7 @@
 use std::ops::Range;
 
 use super::least_squares::polynomial;
-use super::windows::{Windows, window};
+use super::windows::Windows;
 use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
 use crate::model::exp_log::{exp, ln};
 
@@ -49,11 +49,6 @@ impl CubicTrack {
     pub fn position_at(&self, time: f64) -> [f64; 3] {
         let dt = time - self.center;
         std::array::from_fn(|c| self.position.iter().rev().fold(0.0, |sum, row| sum * dt + row[c]))
-    }
-
-    /// Returns the opacity of the curve at `time`.
-    pub fn opacity_at(&self, time: f64) -> f64 {
-        self.opacity * window(time, self.center, self.width)
     }
 }
 
@@ -95,8 +90,8 @@ impl CurveForm {
 
 /// Width of an overlapping window, divided by the distance between the centers of neighboring windows.
 const WIDTH_PER_INTERVAL: f64 = 0.75;
-/// Maximum number of iterations in [`TrackFit::refine_depths`], which distribute the optical depth −ln(1 − opacity)
-/// of a Gaussian among the curves that replace it.
+/// Maximum number of iterations that distribute the optical depth −ln(1 − opacity) of a Gaussian among the curves that
+/// replace it ([`TrackFit::refine_depths`]).
 const MAX_UPDATES: usize = 60;
 /// Tolerance of the iterations in [`TrackFit::refine_depths`]. The iterations end once each curve meets one of two
 /// conditions:
@@ -114,16 +109,18 @@ const RIDGE: f64 = 1e-6;
 /// - The fit of the motion uses frames whose weight (window × opacity) is above this value times
 ///   [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
-
-/// Number of iterations after which the first pass decides whether overlapping curves are hopeless.
+/// Number of iterations in [`TrackFit::refine_depths`] after which the error of overlapping curves is compared with
+/// [`HOPELESS`].
 const FIRST_UPDATES: usize = 4;
-/// If overlapping curves have an error above this multiple of the tolerance after [`FIRST_UPDATES`] iterations, the first
-/// pass skips them. This is a heuristic: more iterations rarely reduce the error by this factor.
+/// Multiple of the tolerance. Overlapping curves whose error is above it after [`FIRST_UPDATES`] iterations are skipped,
+/// because more iterations rarely reduce the error by this factor. If no other curves meet the tolerance, skipped ones
+/// are fitted to the end after all.
 const HOPELESS: f64 = 2.0;
 
 /// Returns curves of the form `form` that represent `track`, the states of a Gaussian at all frames. Tries increasing
-/// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame, without those that
-/// seem hopeless early ([`HOPELESS`]). If none do, returns the curves with the smallest error. Adds the errors of the returned curves to `misfit`.
+/// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame. Numbers of curves whose
+/// error is far too large after a few iterations are skipped ([`HOPELESS`]). If no curves meet the tolerance, returns
+/// those with the smallest error. Adds the errors of the returned curves to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,
@@ -137,8 +134,8 @@ pub fn fit_curves(
     let is_wide = |count: usize| WIDTH_PER_INTERVAL * (span[1] - span[0]) / count as f64 >= form.min_width;
     let max_intervals = form.max_intervals.min((last - first + 1).max(2));
     let counts = || form.intervals().iter().take_while(|&&count| count <= max_intervals && is_wide(count));
-    // The first pass ends each attempt at the first sign that it fails. If every attempt fails, a second pass repeats
-    // the attempts to the end and keeps the curves with the smallest error.
+    // The first pass stops each attempt as soon as its error is too large. If all attempts fail, a second pass repeats
+    // them without stopping, and the curves with the smallest error are kept.
     for seeks_best in [false, true] {
         fit.seeks_best = seeks_best;
         let has_fit = fit.try_constant_curve()
@@ -149,7 +146,7 @@ pub fn fit_curves(
             break;
         }
     }
-    let (_, curves, found) = fit.best;
+    let (_, curves, found) = fit.best.unwrap_or_default();
     *misfit = misfit.merged_with(found);
     curves.into_iter().filter(|curve| curve.opacity >= MIN_VISIBLE_OPACITY).collect()
 }
@@ -159,7 +156,8 @@ fn depth(opacity: f64) -> f64 {
     -ln(1.0 - opacity.clamp(0.0, MAX_OPACITY))
 }
 
-/// Fit of curves to one track: values that every attempt uses, and the best curves so far.
+/// Search for curves that represent one track. An attempt fits a certain number of curves and measures their error. This
+/// struct holds the values that all attempts share, and the best curves so far.
 struct TrackFit<'a> {
     track: &'a FittedTrack,
     form: CurveForm,
@@ -175,11 +173,11 @@ struct TrackFit<'a> {
     samples: Vec<(usize, f64, f64)>,
     /// Time windows of the curves of the current attempt, in their order.
     windows: Windows,
-    /// Whether the curves with the smallest error are kept even if they do not meet the tolerance. Set in the second
-    /// pass.
+    /// Whether the curves with the smallest error are kept even if they do not meet the tolerance: false in the first
+    /// pass over all attempts, true in the second one.
     seeks_best: bool,
-    /// The curves with the smallest error so far: largest ratio of an error to its tolerance, curves, and errors.
-    best: (f64, Vec<CubicTrack>, FitError),
+    /// The curves that are kept so far: largest ratio of an error to its tolerance, curves, and errors.
+    best: Option<(f64, Vec<CubicTrack>, FitError)>,
 }
 
 impl<'a> TrackFit<'a> {
@@ -195,22 +193,29 @@ impl<'a> TrackFit<'a> {
             samples: Vec::new(),
             windows: Windows::default(),
             seeks_best: false,
-            best: (f64::INFINITY, Vec::new(), FitError::default()),
+            best: None,
         }
     }
 
     /// Measures the error of `curves`, whose time windows are in `self.windows`. Keeps the curves if they meet the
     /// tolerance, or if `seeks_best` is set and they are the best so far. Returns whether they meet the tolerance.
     fn keep_if_good(&mut self, curves: Vec<CubicTrack>) -> bool {
-        let limit = match (self.seeks_best, self.best.1.is_empty()) {
-            (false, _) => 1.0,
-            (true, true) => f64::INFINITY,
-            (true, false) => self.best.0.next_down(),
+        let limit = match &self.best {
+            _ if !self.seeks_best => 1.0,
+            Some((least, ..)) => least.next_down(),
+            None => f64::INFINITY,
         };
-        if let Some((excess, found)) = self.measure_misfit(&curves, limit) {
-            self.best = (excess, curves, found);
-        }
-        self.best.0 <= 1.0
+        let Some((excess, found)) = self.measure_misfit(&curves, limit) else { return false };
+        self.best = Some((excess, curves, found));
+        excess <= 1.0
+    }
+
+    /// Makes one window with the center `center` and the width `width` the only one in `self.windows`, and returns the
+    /// curve that [`TrackFit::fit_motion`] fits in it.
+    fn fit_one(&mut self, center: f64, width: f64) -> CubicTrack {
+        self.windows.clear();
+        self.windows.push(&self.track.times, center, width);
+        self.fit_motion(0)
     }
 
     /// Tries one curve with an infinitely wide window. Its opacity is constant: the mean over the visible frames. Returns
@@ -220,17 +225,15 @@ impl<'a> TrackFit<'a> {
         let center = times[0].midpoint(times[times.len() - 1]);
         let seen = (0..times.len()).filter(|&frame| self.visible[frame]);
         let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + self.track.opacity[frame], count + 1.0));
-        self.windows.clear();
-        self.windows.push(times, center, f64::INFINITY);
-        let curve = self.fit_motion(0, center, f64::INFINITY);
+        let curve = self.fit_one(center, f64::INFINITY);
         self.keep_if_good(vec![CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }])
     }
 
     /// Tries one curve. The logarithm of its opacity is a parabola in time, fitted to the visible frames with the squared
-    /// opacity as weight. Returns whether the curve meets the tolerance. The fit is exact if the opacity of the track is a time window, even if only a part of the
+    /// opacity as weight. The fit is exact if the opacity of the track is a time window, even if only a part of the
     /// window lies within the sequence.
     ///
-    /// Returns `false` without a curve in these cases:
+    /// Returns whether the curve meets the tolerance. Returns `false` without trying a curve in these cases:
     /// - Fewer than three frames are visible.
     /// - The parabola does not open downward.
     /// - The opacity at the vertex of the parabola exceeds [`MAX_OPACITY`].
@@ -254,10 +257,7 @@ impl<'a> TrackFit<'a> {
         if !is_usable {
             return false;
         }
-        let width = width.max(self.form.min_width);
-        self.windows.clear();
-        self.windows.push(&track.times, center, width);
-        let curve = self.fit_motion(0, center, width);
+        let curve = self.fit_one(center, width.max(self.form.min_width));
         self.keep_if_good(vec![CubicTrack { opacity: peak, ..curve }])
     }
 
@@ -274,15 +274,13 @@ impl<'a> TrackFit<'a> {
         let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
         // exp(−(dt/w)²) has the variance w²/2. Frames one step apart cannot resolve a width below half a step.
         let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9).max(self.form.min_width);
-        self.windows.clear();
-        self.windows.push(&track.times, center, width);
+        let curve = self.fit_one(center, width);
         let (frames, values) = self.windows.window(0);
         let (mut right, mut normal) = (0.0, 0.0);
         for (value, opacity) in values.iter().zip(&track.opacity[frames]) {
             right += value * opacity;
             normal += value.powi(2);
         }
-        let curve = self.fit_motion(0, center, width);
         self.keep_if_good(vec![CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }])
     }
 
@@ -291,10 +289,9 @@ impl<'a> TrackFit<'a> {
     fn try_overlapping_curves(&mut self, [start, end]: [f64; 2], count: usize) -> bool {
         let apart = ((end - start) / count as f64).max(1e-9);
         let width = WIDTH_PER_INTERVAL * apart;
-        let center = |k: usize| start + k as f64 * apart;
         self.windows.clear();
-        (0..=count).for_each(|k| self.windows.push(&self.track.times, center(k), width));
-        let mut curves: Vec<CubicTrack> = (0..=count).map(|k| self.fit_motion(k, center(k), width)).collect();
+        (0..=count).for_each(|k| self.windows.push(&self.track.times, start + k as f64 * apart, width));
+        let mut curves: Vec<CubicTrack> = (0..=count).map(|k| self.fit_motion(k)).collect();
         let set_depths = |curves: &mut [CubicTrack], depths: &[f64]| {
             curves.iter_mut().zip(depths).for_each(|(curve, depth)| curve.opacity = 1.0 - exp(-depth));
         };
@@ -368,11 +365,11 @@ impl<'a> TrackFit<'a> {
     }
 
     /// Returns a curve that follows the position and rotation of the track by least squares. Its time window is window
-    /// `k` of `self.windows`, with the center `center` and the width `width`. The weight of a frame is its opacity times
-    /// the window. Scales and SH coefficients are weighted means. The opacity of the curve is left at 0, for the caller
-    /// to set.
-    fn fit_motion(&mut self, k: usize, center: f64, width: f64) -> CubicTrack {
+    /// `k` of `self.windows`. The weight of a frame is the opacity of the Gaussian times the value of the window. Scales
+    /// and SH coefficients are weighted means. The opacity of the curve is 0; the caller sets it.
+    fn fit_motion(&mut self, k: usize) -> CubicTrack {
         let track = self.track;
+        let [center, width] = self.windows.shape(k);
         let (frames, values) = self.windows.window(k);
         self.samples.clear();
         for (frame, value) in frames.zip(values) {
@@ -478,6 +475,7 @@ impl<'a> TrackFit<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fit::windows::window;
 
     fn track(frames: usize, position: impl Fn(f64) -> [f64; 3], opacity: impl Fn(f64) -> f64) -> FittedTrack {
         let times: Vec<f64> = (0..frames).map(|i| i as f64 / frames as f64).collect();

@@ -14,9 +14,11 @@ pub(super) fn window(time: f64, center: f64, width: f64) -> f64 {
     if widths.abs() < MAX_WIDTHS { exp(-widths * widths) } else { 0.0 }
 }
 
-/// Values of several windows at the frames of one track.
+/// Several windows, with their values at the frames of one track.
 #[derive(Default)]
 pub(super) struct Windows {
+    /// For each window, its center and its width.
+    shapes: Vec<[f64; 2]>,
     /// For each window, the frames at which it is not 0, and the index in `values` of its value at the first of them.
     frames: Vec<(Range<usize>, usize)>,
     /// Values of all windows at these frames, one window after the other.
@@ -26,6 +28,7 @@ pub(super) struct Windows {
 impl Windows {
     /// Removes all windows.
     pub(super) fn clear(&mut self) {
+        self.shapes.clear();
         self.frames.clear();
         self.values.clear();
     }
@@ -35,11 +38,14 @@ impl Windows {
         debug_assert!(times.is_sorted());
         let first = times.partition_point(|time| (time - center) / width <= -MAX_WIDTHS);
         let end = times.partition_point(|time| (time - center) / width < MAX_WIDTHS).max(first);
+        self.shapes.push([center, width]);
         self.frames.push((first..end, self.values.len()));
-        self.values.extend(times[first..end].iter().map(|&time| {
-            let widths = (time - center) / width;
-            exp(-widths * widths)
-        }));
+        self.values.extend(times[first..end].iter().map(|&time| window(time, center, width)));
+    }
+
+    /// Returns the center and the width of window `k`.
+    pub(super) fn shape(&self, k: usize) -> [f64; 2] {
+        self.shapes[k]
     }
 
     /// Returns the frames at which window `k` is not 0, and its values there.

@@ -58,13 +58,13 @@ impl RefineStage {
         need
     }
 
-    /// Fits the model `reduction` to photographs and to renders of the original. The first target views are `seen`, views
-    /// from the scene's cameras, with their photographs in `photographs`; the others are renders from new cameras. Some
-    /// photographs are held back for validation (see [`Targets::with_photographs`]). Returns the state of the model with
-    /// the highest PSNR against these, which may be `reduction` itself.
+    /// Fits the model `reduction` to photographs and to renders of the original. The target views are the views `seen`
+    /// from the scene's cameras, whose photographs are in `photographs`, and views from new cameras, which are renders.
+    /// Some photographs are held back for validation (see [`Targets::with_photographs`]). Returns the state of the model
+    /// with the highest PSNR against the photographs that are held back. This may be `reduction` itself.
     ///
-    /// Records in `journal` the PSNR against these photographs before and after the fit. If the fit did not raise it,
-    /// records the reason instead.
+    /// Records in `journal` the PSNR against the photographs that are held back, before and after the fit. If the fit did
+    /// not raise it, records the reason instead.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if a scratch file cannot be written.
