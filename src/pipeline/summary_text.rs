@@ -191,7 +191,7 @@ impl Summary {
         }
         match self.notes.len() - shown {
             0 => Ok(()),
-            more => writeln!(out, "{more} more notes with --verbose"),
+            more => writeln!(out, "{} with --verbose", counted(more, "more note")),
         }
     }
 

@@ -190,24 +190,24 @@ impl Targets {
         let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [RenderedSource::all_gaussians(scene.source())];
             let mut next = some.start;
+            // One renderer per view of a batch; its buffers serve all batches.
+            let mut renderers: Vec<Renderer> = Vec::new();
             for_each_view_batch(
                 subject,
                 &self.cameras,
                 &self.pictures[some],
                 BatchLimits::one_frame(&scene.limits),
                 |views| {
-                    let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
+                    let picture = |(k, (view, renderer)): (usize, (&ViewStates<'_, 1>, &mut Renderer))| {
                         let grid = self.grid(next + k, self.stride);
                         Ok(narrow(&match photograph(view.picture) {
                             Some(photograph) => sampled(&photograph?, grid),
-                            None => Renderer::on_all_threads().render(
-                                view.states[0],
-                                grid.sampled_view(view.camera),
-                                scene.background,
-                            ),
+                            None => renderer.render(view.states[0], grid.sampled_view(view.camera), scene.background),
                         }))
                     };
-                    let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect::<Result<_>>()?;
+                    renderers.resize_with(renderers.len().max(views.len()), Renderer::on_all_threads);
+                    let jobs = views.par_iter().zip(renderers.par_iter_mut()).enumerate();
+                    let made: Vec<Vec<u16>> = jobs.map(picture).collect::<Result<_>>()?;
                     next += views.len();
                     made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
                 },

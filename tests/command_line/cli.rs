@@ -5,7 +5,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use crate::scene::{PlyRows, Workplace, arrays, files, state, tiny};
+use crate::scene::{PlyRows, Workplace, arrays, files, program, state, tiny};
 use splatsieve::files::container::Container;
 
 const CLOUD: &str = "model/point_cloud/iteration_7/point_cloud.ply";
@@ -497,12 +497,8 @@ fn score_writes_one_array_per_column() {
 #[test]
 fn closed_stdout_is_no_failure() {
     for arguments in [&["recipe"][..], &["completions", "bash"], &["--help"]] {
-        let mut child = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
-            .args(arguments)
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
+        let mut child =
+            Command::new(program()).args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         // Without a reader of standard output the first write fails.
         drop(child.stdout.take());
         let output = child.wait_with_output().unwrap();

@@ -7,7 +7,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::scene::{Workplace, files, tiny};
+use crate::scene::{Workplace, files, program, tiny};
 
 /// C source of a library that records system calls: it passes `fsync` and `rename` on unchanged and appends each call
 /// to the file that the environment variable NOTES names, in order.
@@ -55,7 +55,7 @@ fn recorded_calls(workplace: &Workplace, shim: &Path, arguments: &str) -> Vec<Ca
     let notes = workplace.path("notes");
     let _ = fs::remove_file(&notes);
     let words = arguments.split_whitespace().map(|word| if word == "{tiny}" { tiny() } else { workplace.path(word) });
-    let output = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
+    let output = Command::new(program())
         .args(arguments.split_whitespace().zip(words).map(|(word, path)| match word {
             word if word.starts_with('{') || word.contains('.') || word == "out" => path.into_os_string(),
             word => word.into(),

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use crate::scene::{Workplace, tiny};
+use crate::scene::{Workplace, program, tiny};
 
 #[test]
 fn recovering_no_frame_fails_and_writes_nothing() {
@@ -165,8 +165,8 @@ fn no_message_contains_debug_formatting() {
 fn full_disk_error_names_the_file_being_written() {
     let workplace = Workplace::new();
     fs::create_dir(workplace.path("disk")).unwrap();
-    let (program, tiny) = (env!("CARGO_BIN_EXE_splatsieve"), tiny());
-    let tiny = tiny.display();
+    let (program, tiny) = (program(), tiny());
+    let (program, tiny) = (program.display(), tiny.display());
     for (run, named) in [
         (format!("convert {tiny} disk/x.gseq"), "disk/x.gseq: No space"),
         (format!("convert {tiny} disk/x --as ply-sequence"), "disk/x/frame_0000"),

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::scene::{Workplace, files, lasting_files, said};
+use crate::scene::{Workplace, files, lasting_files, program, said};
 use splatsieve::error::Result;
 use splatsieve::model::hash_id;
 use splatsieve::model::{Attributes, Gaussians, SequenceInfo};
@@ -202,7 +202,7 @@ fn next_run_cleans_up_after_a_killed_run() {
     const KILLS: u32 = 6;
     let mut dirty = false;
     for kill in 0..KILLS {
-        let mut child = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
+        let mut child = Command::new(program())
             .current_dir(workplace.path(""))
             .args(arguments.split_whitespace())
             .stderr(Stdio::null())

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use crate::scene::{Workplace, state, tiny};
+use crate::scene::{Workplace, program, state, tiny};
 use splatsieve::files::container::Container;
 use splatsieve::model::Attributes;
 use splatsieve::source::FrameSource;
@@ -33,7 +33,7 @@ fn run(command: &mut Command, workplace: &Workplace) -> Vec<u8> {
 fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Container {
     let stream = run(exporter, workplace);
     fs::write(workplace.path("stream"), stream).unwrap();
-    let status = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
+    let status = Command::new(program())
         .args(["convert", "-", name])
         .current_dir(workplace.path(""))
         .stdin(fs::File::open(workplace.path("stream")).unwrap())
@@ -123,7 +123,7 @@ fn failing_exporter_writes_no_end_mark() {
             raise SystemExit(1)";
     let output = Command::new(python).args(["-c", code]).arg(script("")).output().unwrap();
     fs::write(workplace.path("stream"), output.stdout).unwrap();
-    let output = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
+    let output = Command::new(program())
         .args(["convert", "-", "a.gseq"])
         .current_dir(workplace.path(""))
         .stdin(fs::File::open(workplace.path("stream")).unwrap())
@@ -295,7 +295,7 @@ fn scale_script_reports_cost_of_every_size() {
     let python = python("numpy");
     let workplace = Workplace::new();
     let mut scale = Command::new(python);
-    scale.arg(script("benchmark/scale.py")).arg(assert_cmd::cargo::cargo_bin("splatsieve")).arg("unused");
+    scale.arg(script("benchmark/scale.py")).arg(program()).arg("unused");
     scale.args(["--sizes", "300x20,3000x20", "--limits", "none", "--results", "here"]);
     run(&mut scale, &workplace);
     let written = fs::read_to_string(workplace.path("here/scale.csv")).unwrap();
@@ -311,7 +311,7 @@ fn scale_script_reports_cost_of_every_size() {
 fn bars_fit_the_terminal_and_leave_no_line_behind() {
     let workplace = Workplace::new();
     workplace.done("test-scene --gaussians 2000 --frames 16 -o demo --no-refine");
-    let program = assert_cmd::cargo::cargo_bin("splatsieve");
+    let program = program();
     let mut terminal = Command::new(python("pty"));
     terminal.arg(script("terminal.py")).args(["--columns", "60,100,120"]).arg(program);
     let sweep =

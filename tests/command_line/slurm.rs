@@ -4,17 +4,16 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::scene::program;
+
 #[test]
 #[ignore = "needs Slurm"]
 fn slurm_shards_and_scenes_give_the_same_bytes() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    // The optimized program, if its path is given; the debug program takes several times as long.
-    let program = std::env::var_os("SPLATSIEVE_PROGRAM")
-        .map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from);
     let data = std::env::var_os("SPLATSIEVE_DATA").map_or_else(|| root.join("../shared/data"), PathBuf::from);
     let model = data.join("room2_big");
     let mut command = Command::new(std::env::var_os("PYTHON").unwrap_or_else(|| "python3".into()));
-    command.arg(root.join("tests/slurm/check.py")).arg(program);
+    command.arg(root.join("tests/slurm/check.py")).arg(program());
     if model.is_dir() {
         command.arg(model);
     }
