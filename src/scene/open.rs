@@ -180,7 +180,7 @@ pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> 
 }
 
 /// Warning about a scene without cameras, shown at the start and at the end of a run.
-const NO_CAMERAS: &str = "no cameras were given or found. Gaussians are ranked and refined for invented views, which costs \
+const NO_CAMERAS: &str = "no cameras were given or found. Gaussians are ranked and refined for virtual views, which costs \
                           most of the quality; give the training cameras with --cameras";
 
 /// Number of frames at which a model is evaluated if neither its cameras nor the user give one.

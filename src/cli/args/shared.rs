@@ -119,7 +119,7 @@ pub(in crate::cli) struct Memory {
 pub(in crate::cli) struct CameraFile {
     /// Cameras: the data folder, or transforms*.json, cameras.json, poses_bounds.npy, a COLMAP reconstruction, or
     /// dataset.json (NeRFies, HyperNeRF). A folder gives all its splits, a file only itself [default: the data folder
-    /// named in cfg_args; without it, invented views]
+    /// named in cfg_args; without it, virtual views]
     #[arg(long, help_heading = CAMERAS, value_name = "PATH")]
     pub(in crate::cli) cameras: Option<PathBuf>,
     /// Number of evenly spaced frames, for a model that is continuous in time [default: the times of the cameras]

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
+use std::ops::Range;
 use std::path::Path;
 
 use serde_json::{Map, Value, json};
@@ -16,8 +17,11 @@ use crate::model::{Gaussians, color_from_sh, opacity};
 const F32: u32 = 5126;
 const U8: u32 = 5121;
 
-/// Function that appends the value of one attribute, for the Gaussian with a given index, to a list of bytes.
-type WriteValue<'a> = Box<dyn Fn(usize, &mut Vec<u8>) + 'a>;
+/// Number of Gaussians whose values of an attribute are written at once.
+const ROWS: usize = 4096;
+
+/// Function that appends the values of one attribute, for the Gaussians with the given indices, to a list of bytes.
+type WriteValues<'a> = Box<dyn Fn(Range<usize>, &mut Vec<u8>) + 'a>;
 
 /// Attribute of the glTF primitive that is written, such as the positions of all Gaussians.
 struct Attribute<'a> {
@@ -27,7 +31,7 @@ struct Attribute<'a> {
     component: u32,
     /// Number of bytes that the attribute takes per Gaussian.
     bytes: usize,
-    write: WriteValue<'a>,
+    write: WriteValues<'a>,
 }
 
 /// Writes the Gaussians `state` to a `.glb` file at `path`, with f32 values.
@@ -86,9 +90,9 @@ pub fn write_glb(state: &Gaussians, path: &Path) -> Result<()> {
         }
         let mut bytes = Vec::new();
         for attribute in &attributes {
-            for row in 0..count {
+            for start in (0..count).step_by(ROWS) {
                 bytes.clear();
-                (attribute.write)(row, &mut bytes);
+                (attribute.write)(start..(start + ROWS).min(count), &mut bytes);
                 out.write_all(&bytes)?;
             }
         }
@@ -99,65 +103,49 @@ pub fn write_glb(state: &Gaussians, path: &Path) -> Result<()> {
 
 /// Returns the attributes of the glTF primitive for the Gaussians `state`, in the order in which they are written.
 fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
-    let f32s = |values: &[f32], out: &mut Vec<u8>| values.iter().for_each(|x| out.extend(x.to_le_bytes()));
-    let attribute =
-        |name: String, kind, floats: usize, write| Attribute { name, kind, component: F32, bytes: 4 * floats, write };
     let of_extension = |name: &str| format!("{EXTENSION}:{name}");
-    let mut all: Vec<Attribute> = vec![
-        attribute(
-            "POSITION".to_owned(),
-            "VEC3",
-            3,
-            Box::new(move |row, out: &mut Vec<u8>| f32s(&reversed(state.position.row::<3>(row)), out)),
-        ),
-        attribute(
-            of_extension("ROTATION"),
-            "VEC4",
-            4,
-            Box::new(move |row, out: &mut Vec<u8>| {
-                let q = state.rotation.row::<4>(row).map(f64::from);
-                let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
-                let unit = if length > 0.0 { q.map(|x| (x / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
-                let [w, x, y, z] = unit;
-                f32s(&[-x, -y, z, w], out);
-            }),
-        ),
-        attribute(
-            of_extension("SCALE"),
-            "VEC3",
-            3,
-            Box::new(move |row, out: &mut Vec<u8>| {
-                f32s(&state.log_scale.row::<3>(row).map(|log| f64::from(log).exp() as f32), out);
-            }),
-        ),
-        attribute(
-            of_extension("OPACITY"),
-            "SCALAR",
-            1,
-            Box::new(move |row, out: &mut Vec<u8>| {
-                f32s(&[opacity(state.opacity_logit.row::<1>(row)[0]) as f32], out);
-            }),
-        ),
+    let rotation = move |row| {
+        let q = state.rotation.row::<4>(row).map(f64::from);
+        let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+        let [w, x, y, z] = if length > 0.0 { q.map(|x| (x / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
+        [-x, -y, z, w]
+    };
+    let scale = move |row| state.log_scale.row::<3>(row).map(|log| f64::from(log).exp() as f32);
+    let mut all = vec![
+        floats("POSITION".to_owned(), "VEC3", move |row| reversed(state.position.row::<3>(row))),
+        floats(of_extension("ROTATION"), "VEC4", rotation),
+        floats(of_extension("SCALE"), "VEC3", scale),
+        floats(of_extension("OPACITY"), "SCALAR", move |row| [opacity(state.opacity_logit.row::<1>(row)[0]) as f32]),
     ];
     for k in 0..state.sh.width() / 3 {
         let sign = if k == 0 { 1.0 } else { AXIS_SIGNS[k - 1] };
-        let write: WriteValue = Box::new(move |row, out: &mut Vec<u8>| {
-            f32s(&[0, 1, 2].map(|c| sign * state.sh.plane(3 * k + c)[row]), out);
-        });
-        all.push(attribute(sh_attribute(k), "VEC3", 3, write));
+        let planes = [0, 1, 2].map(|c| state.sh.plane(3 * k + c));
+        all.push(floats(sh_attribute(k), "VEC3", move |row| planes.map(|plane| sign * plane[row])));
     }
+    let color = move |row| {
+        let [r, g, b] = state.sh.row::<3>(row).map(|dc| byte(linear(color_from_sh(dc).clamp(0.0, 1.0))));
+        [r, g, b, byte(opacity(state.opacity_logit.row::<1>(row)[0]))]
+    };
     all.push(Attribute {
         name: "COLOR_0".to_owned(),
         kind: "VEC4",
         component: U8,
         bytes: 4,
-        write: Box::new(move |row, out| {
-            let rgb = state.sh.row::<3>(row).map(|dc| byte(linear(color_from_sh(dc).clamp(0.0, 1.0))));
-            out.extend(rgb);
-            out.push(byte(opacity(state.opacity_logit.row::<1>(row)[0])));
-        }),
+        write: Box::new(move |rows, out| rows.for_each(|row| out.extend_from_slice(&color(row)))),
     });
     all
+}
+
+/// Returns an attribute of `N` f32 values per Gaussian. `value` returns the values of the Gaussian with a given index.
+fn floats<'a, const N: usize>(
+    name: String,
+    kind: &'static str,
+    value: impl Fn(usize) -> [f32; N] + 'a,
+) -> Attribute<'a> {
+    let write: WriteValues = Box::new(move |rows, out| {
+        rows.for_each(|row| out.extend_from_slice(value(row).map(f32::to_le_bytes).as_flattened()));
+    });
+    Attribute { name, kind, component: F32, bytes: 4 * N, write }
 }
 
 /// Checks that the scales and SH coefficients of `state` are finite. The caller has already checked the positions.
