@@ -91,7 +91,7 @@ fn deform(criterion: &mut Criterion) {
     for (name, field) in
         [("dnerf_jacobian", field(64, 32, three)), ("dynerf_jacobian", field(128, 16, Attributes::all()))]
     {
-        let prepared = field.prepare(&raw.position);
+        let prepared = field.prepare_with_slopes(&raw.position);
         group.bench_function(name, |bencher| {
             bencher.iter(|| field.jacobian(&raw, &prepared, 0.4, Attributes::POSITION))
         });

@@ -81,7 +81,7 @@ pub struct Field {
 #[derive(Debug, Clone)]
 pub struct PreparedPositions {
     rows: usize,
-    input: PreparedInput,
+    pub(super) input: PreparedInput,
     /// Mask of each Gaussian, interpolated in the voxel grid of the field; `None` if the field has no voxel grid. A
     /// mask is a factor on the stored attributes of the Gaussian, before deltas are added.
     voxel: Option<Vec<f32>>,
@@ -89,7 +89,7 @@ pub struct PreparedPositions {
 
 /// Time-independent part of the input of the trunk (first MLP): plane features, or positions.
 #[derive(Debug, Clone)]
-enum PreparedInput {
+pub(super) enum PreparedInput {
     Planes(PreparedPlanes),
     Position(AttributeValues),
 }
@@ -177,10 +177,15 @@ impl Field {
         &self.config
     }
 
-    /// Returns the bytes of memory per Gaussian that [`PreparedPositions`] takes.
+    /// Returns the bytes of memory per Gaussian that the result of [`Field::prepare`] takes.
     pub fn bytes_per_gaussian(&self) -> usize {
         let input = self.planes.as_ref().map_or(12, Planes::bytes_per_gaussian);
         input + if matches!(self.mask, Mask::Voxel(_)) { 4 } else { 0 }
+    }
+
+    /// Returns the bytes of memory per Gaussian that the result of [`Field::prepare_with_slopes`] takes.
+    pub fn bytes_per_gaussian_with_slopes(&self) -> usize {
+        self.bytes_per_gaussian() + self.planes.as_ref().map_or(0, Planes::slope_bytes_per_gaussian)
     }
 
     /// Returns the number of multiplications by weights that one evaluation of one Gaussian at one time takes.
@@ -192,10 +197,25 @@ impl Field {
     /// Computes the part of the evaluation that does not depend on time, for Gaussians at the stored positions
     /// `position` (`[3, N]`).
     pub fn prepare(&self, position: &AttributeValues) -> PreparedPositions {
+        self.prepare_by(position, Planes::prepare)
+    }
+
+    /// Computes what [`Field::prepare`] does, and the part of the derivatives that does not depend on time, which
+    /// [`Field::jacobian`] needs.
+    pub fn prepare_with_slopes(&self, position: &AttributeValues) -> PreparedPositions {
+        self.prepare_by(position, Planes::prepare_with_slopes)
+    }
+
+    /// Prepares Gaussians at `position`; `sample` computes the part that comes from the planes.
+    fn prepare_by(
+        &self,
+        position: &AttributeValues,
+        sample: fn(&Planes, &AttributeValues) -> PreparedPlanes,
+    ) -> PreparedPositions {
         PreparedPositions {
             rows: position.len(),
             input: match &self.planes {
-                Some(planes) => PreparedInput::Planes(planes.prepare(position)),
+                Some(planes) => PreparedInput::Planes(sample(planes, position)),
                 None => PreparedInput::Position(position.clone()),
             },
             voxel: match &self.mask {

@@ -9,8 +9,11 @@
 //! [`LANES`] Gaussians. Derived in docs/method.md, section 8.2.
 
 use super::deltas::{Deltas, finite};
-use super::field::{Field, Head, LayerBuffers, Mask, PreparedPositions, add_frequencies, position_time_features};
+use super::field::{
+    Field, Head, LayerBuffers, Mask, PreparedInput, PreparedPositions, add_frequencies, position_time_features,
+};
 use super::linear::{CacheLine, LANES, Linear};
+use super::planes::{Planes, PreparedPlanes};
 use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
@@ -33,7 +36,7 @@ impl Field {
     /// the attributes at that time: the stored ones `raw` plus the delta that the field predicts.
     ///
     /// - `raw` must contain positions, and rotations if `want` contains them.
-    /// - `prepared` is what [`Field::prepare`] returned for these positions.
+    /// - `prepared` is what [`Field::prepare_with_slopes`] returned for these positions.
     /// - A derivative that is not finite becomes 0. The derivative of a position is I + ∂delta/∂position; of this sum,
     ///   only ∂delta/∂position becomes 0.
     ///
@@ -42,7 +45,7 @@ impl Field {
     /// this change.
     ///
     /// # Errors
-    /// Fails if `time` is not finite.
+    /// Fails if `time` is not finite, or if `prepared` has no slopes although they are needed.
     pub fn jacobian(
         &self,
         raw: &Gaussians,
@@ -60,7 +63,8 @@ impl Field {
         if let Mask::None = self.mask {
             let head = self.heads.iter().find(|head| head.column == Some(Attributes::POSITION));
             if let Some(head) = head.filter(|_| want.contains(Attributes::POSITION)) {
-                *found.column_mut(Attributes::POSITION) = self.position_jacobian(head, &raw.position, time as f32);
+                let position = self.position_jacobian(head, &raw.position, prepared, time as f32)?;
+                *found.column_mut(Attributes::POSITION) = position;
             }
         }
         let held = match self.mask {
@@ -78,17 +82,30 @@ impl Field {
 
     /// Computes the derivative of the positions at `time` with respect to the stored positions `position`. `head` is
     /// the MLP that computes the position deltas. Plane `3·i + j` of the result is ∂ component i / ∂ stored component
-    /// j.
-    fn position_jacobian(&self, head: &Head, position: &AttributeValues, time: f32) -> AttributeValues {
+    /// j. Fails if `prepared` has no slopes although the field has planes.
+    fn position_jacobian(
+        &self,
+        head: &Head,
+        position: &AttributeValues,
+        prepared: &PreparedPositions,
+        time: f32,
+    ) -> Result<AttributeValues> {
         let mut out = AttributeValues::zeros(9, position.len());
+        let planes = match (&self.planes, &prepared.input) {
+            (None, _) => None,
+            (Some(planes), PreparedInput::Planes(block)) if block.has_slopes(planes, position.len()) => {
+                Some((planes, block))
+            }
+            _ => return Err(Error::internal("the block was prepared without slopes, or by another deformation field")),
+        };
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
             // SAFETY: AVX2 and FMA were detected on the line above.
-            unsafe { self.position_jacobian_by_group_fma(head, position, time, &mut out) };
-            return out;
+            unsafe { self.position_jacobian_by_group_fma(head, position, planes, time, &mut out) };
+            return Ok(out);
         }
-        self.position_jacobian_by_group::<false>(head, position, time, &mut out);
-        out
+        self.position_jacobian_by_group::<false>(head, position, planes, time, &mut out);
+        Ok(out)
     }
 
     /// Calls [`Field::position_jacobian_by_group`], compiled for the instruction sets AVX2 and FMA.
@@ -98,10 +115,11 @@ impl Field {
         &self,
         head: &Head,
         position: &AttributeValues,
+        planes: Option<(&Planes, &PreparedPlanes)>,
         time: f32,
         out: &mut AttributeValues,
     ) {
-        self.position_jacobian_by_group::<true>(head, position, time, out);
+        self.position_jacobian_by_group::<true>(head, position, planes, time, out);
     }
 
     /// Computes the result of [`Field::position_jacobian`] into `out`, in groups of [`LANES`] Gaussians. The compiler
@@ -111,19 +129,23 @@ impl Field {
         &self,
         head: &Head,
         position: &AttributeValues,
+        planes: Option<(&Planes, &PreparedPlanes)>,
         time: f32,
         out: &mut AttributeValues,
     ) {
-        let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
+        let lines = planes.map_or(Vec::new(), |(planes, _)| planes.lines(time));
         let mut group = JacobianGroup::default();
         for start in (0..position.len()).step_by(LANES) {
             let rows = start..position.len().min(start + LANES);
             let positions = [0, 1, 2].map(|axis| &position.plane(axis)[rows.clone()]);
-            match &self.planes {
-                Some(planes) => planes.features_with_slopes(positions, &lines, &mut group.features, &mut group.slopes),
-                None => position_time_features(positions, time, &mut group.features),
+            let JacobianGroup { features, slopes, .. } = &mut group;
+            match planes {
+                Some((planes, block)) => {
+                    planes.features_with_slopes(positions, (block, start), &lines, features, slopes);
+                }
+                None => position_time_features(positions, time, features),
             }
-            if self.planes.is_some() && self.config.grid_pe > 1 {
+            if planes.is_some() && self.config.grid_pe > 1 {
                 add_frequencies(&mut group.features, self.config.grid_pe as f32);
             }
             group.forward::<FMA>(self, head);
@@ -133,11 +155,11 @@ impl Field {
                 group.gradient.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
                 group.gradient[component] = CacheLine([1.0; LANES]);
                 group.backward::<FMA>(self, head);
-                if self.planes.is_some() && self.config.grid_pe > 1 {
+                if planes.is_some() && self.config.grid_pe > 1 {
                     frequencies_backward(&group.features, self.config.grid_pe as f32, &mut group.gradient);
                 }
                 for axis in 0..3 {
-                    let through_delta = match &self.planes {
+                    let through_delta = match planes {
                         Some(_) => group.axis_derivative(axis),
                         None => group.gradient[axis],
                     };

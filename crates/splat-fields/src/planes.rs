@@ -2,8 +2,9 @@
 //! resolutions (levels). A feature of a level is the product of bilinear samples of its six planes.
 //!
 //! Input: stored positions `[3, N]`, a time. Output: features `[Σ channels, LANES]`, the channels of all levels for a
-//! group of Gaussians. Memory: 4·Σ channels + 36·levels bytes per prepared Gaussian. Source: Cao & Johnson, "HexPlane",
-//! 2023; Wu et al., "4D Gaussian Splatting", 2024, section 4.2.
+//! group of Gaussians. Memory: 4·Σ channels + 36·levels bytes per prepared Gaussian, and 12·Σ channels more with slopes
+//! (derivatives with respect to position). Source: Cao & Johnson, "HexPlane", 2023; Wu et al., "4D Gaussian Splatting",
+//! 2024, section 4.2.
 //!
 //! The samples of the three planes without time do not depend on time, so their product is computed once per block of
 //! Gaussians. All Gaussians share the time of a frame, so each plane with time is first interpolated along time into a
@@ -100,10 +101,20 @@ pub struct TexelPair {
 pub(super) struct PreparedPlanes {
     /// Product of the features that were sampled at each Gaussian from the planes over (x, y), (x, z) and (y, z):
     /// `[rows, width]`, one row per Gaussian with the channels of all levels (resolutions).
-    product: Vec<f32>,
+    pub(super) product: Vec<f32>,
     /// Position of each Gaussian along x, y and z in the planes over (x, t), (y, t) and (z, t), as two texels and a
     /// weight: `[rows, levels, 3]`, one row per Gaussian.
-    taps: Vec<TexelPair>,
+    pub(super) taps: Vec<TexelPair>,
+    /// Derivatives of `product` with respect to the normalized coordinates: `[rows, 3, width]`, one row per Gaussian with
+    /// the axes x, y and z. Empty if no Jacobian will be computed.
+    pub(super) slopes: Vec<f32>,
+}
+
+impl PreparedPlanes {
+    /// Returns whether slopes of `rows` Gaussians were computed, for the planes `planes`.
+    pub(super) fn has_slopes(&self, planes: &Planes, rows: usize) -> bool {
+        self.slopes.len() == 3 * planes.width() * rows
+    }
 }
 
 impl FeaturePlane {
@@ -207,9 +218,14 @@ impl Planes {
         self.levels.iter().map(|level| level.channels).sum()
     }
 
-    /// Returns the bytes of memory per Gaussian that [`PreparedPlanes`] takes.
+    /// Returns the bytes of memory per Gaussian that [`PreparedPlanes`] takes, without slopes.
     pub(super) fn bytes_per_gaussian(&self) -> usize {
         4 * self.width() + 3 * self.levels.len() * size_of::<TexelPair>()
+    }
+
+    /// Returns the bytes of memory per Gaussian that the slopes of [`PreparedPlanes`] take.
+    pub(super) fn slope_bytes_per_gaussian(&self) -> usize {
+        3 * 4 * self.width()
     }
 
     /// Returns two corners of the box in scene units: the one mapped to normalized coordinates −1, then the one mapped
@@ -224,8 +240,11 @@ impl Planes {
     pub(super) fn prepare(&self, position: &AttributeValues) -> PreparedPlanes {
         let rows = position.len();
         let width = self.width();
-        let mut prepared =
-            PreparedPlanes { product: vec![1.0; rows * width], taps: Vec::with_capacity(rows * 3 * self.levels.len()) };
+        let mut prepared = PreparedPlanes {
+            product: vec![1.0; rows * width],
+            taps: Vec::with_capacity(rows * 3 * self.levels.len()),
+            slopes: Vec::new(),
+        };
         let mut sample = vec![0.0; width];
         for (i, row) in prepared.product.chunks_exact_mut(width).enumerate() {
             let u = self.space.normalized(position.row(i));

@@ -3,11 +3,12 @@
 //! Input: stored positions of a group of Gaussians, and the planes with time, interpolated at one time. Output:
 //! features `[Σ channels, LANES]`, and for each of the axes x, y and z as many derivatives. The derivative of a feature
 //! along an axis is a sum of three terms, one for each plane with this axis: the derivative of the sample of this plane
-//! times the other five samples. Coordinates outside the box are clamped, so their derivative is 0. Allocates nothing
-//! beyond the output.
+//! times the other five samples. Coordinates outside the box are clamped, so their derivative is 0. What depends only on
+//! the planes without time is computed once per block of Gaussians ([`Planes::prepare_with_slopes`]).
 
 use super::linear::{CacheLine, LANES};
-use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, texel_pair, texels};
+use super::planes::{FeaturePlane, Planes, PreparedPlanes, SPATIAL, TimeLines, texel_pair, texels};
+use splat_core::AttributeValues;
 
 /// Returns how many texels (grid points of a feature plane) lie in one unit of the normalized coordinate `u` along an
 /// axis of `size` texels. This factor converts derivatives per texel to derivatives with respect to `u`. Returns 0
@@ -105,10 +106,45 @@ impl TimeLineSegment<'_> {
 }
 
 impl Planes {
+    /// Computes the part of the features and of their derivatives that does not depend on time, for Gaussians at the
+    /// stored positions `position` (`[3, N]`).
+    pub(super) fn prepare_with_slopes(&self, position: &AttributeValues) -> PreparedPlanes {
+        let width = self.width();
+        let mut prepared = self.prepare(position);
+        prepared.slopes = vec![0.0; 3 * width * position.len()];
+        for (i, row) in prepared.slopes.chunks_exact_mut(3 * width).enumerate() {
+            let u = self.space.normalized(position.row(i));
+            let mut before = 0;
+            for level in &self.levels {
+                let n = level.channels;
+                let patch = |k: usize| {
+                    let (_, a, b) = SPATIAL[k];
+                    BilinearPatch::new(&level.spatial[k], [u[a], u[b]], n)
+                };
+                let [xy, xz, yz] = [patch(0), patch(1), patch(2)];
+                for first in (0..n).step_by(CHANNEL_CHUNK) {
+                    let ([xy, xy_x, xy_y], [xz, xz_x, xz_z]) =
+                        (xy.sample_with_slopes(first), xz.sample_with_slopes(first));
+                    let [yz, yz_y, yz_z] = yz.sample_with_slopes(first);
+                    for c in 0..CHANNEL_CHUNK.min(n - first) {
+                        let channel = before + first + c;
+                        row[channel] = yz[c] * (xy_x[c] * xz[c] + xy[c] * xz_x[c]);
+                        row[width + channel] = xz[c] * (xy_y[c] * yz[c] + xy[c] * yz_y[c]);
+                        row[2 * width + channel] = xy[c] * (xz_z[c] * yz[c] + xz[c] * yz_z[c]);
+                    }
+                }
+                before += n;
+            }
+        }
+        prepared
+    }
+
     /// Computes the plane features of up to [`LANES`] Gaussians at one time, and their derivatives with respect to the
     /// position.
     ///
     /// - `x`, `y`, `z`: positions of the Gaussians, scene units.
+    /// - `prepared`: block that [`Planes::prepare_with_slopes`] returned; `start` is the index of the first of these
+    ///   Gaussians in it.
     /// - `lines`: the planes with a time axis, interpolated at this time ([`Planes::lines`]).
     /// - `features`: receives the features. Values of unused lanes are unspecified.
     /// - `slopes`: receives the derivatives of the features with respect to x, y and z.
@@ -116,54 +152,52 @@ impl Planes {
     pub(super) fn features_with_slopes(
         &self,
         [x, y, z]: [&[f32]; 3],
+        (prepared, start): (&PreparedPlanes, usize),
         lines: &[TimeLines],
         features: &mut Vec<CacheLine>,
         slopes: &mut [Vec<CacheLine>; 3],
     ) {
-        let width = self.width();
+        let (width, tap_count) = (self.width(), 3 * self.levels.len());
         for out in slopes.iter_mut().chain([&mut *features]) {
             out.resize(width, CacheLine([0.0; LANES]));
         }
-        for (lane, ((&x, &y), &z)) in x.iter().zip(y).zip(z).enumerate() {
+        let blocks = prepared.product[start * width..].chunks_exact(width);
+        let blocks = blocks.zip(prepared.slopes[3 * start * width..].chunks_exact(3 * width));
+        let blocks = blocks.zip(prepared.taps[start * tap_count..].chunks_exact(tap_count));
+        for (lane, (((&x, &y), &z), ((product, space), taps))) in x.iter().zip(y).zip(z).zip(blocks).enumerate() {
             let u = self.space.normalized([x, y, z]);
+            let space = [&space[..width], &space[width..2 * width], &space[2 * width..]];
             let mut before = 0;
-            for (level, lines) in self.levels.iter().zip(lines) {
+            for ((level, lines), taps) in self.levels.iter().zip(lines).zip(taps.chunks_exact(3)) {
                 let n = level.channels;
-                let patch = |k: usize| {
-                    let (_, a, b) = SPATIAL[k];
-                    BilinearPatch::new(&level.spatial[k], [u[a], u[b]], n)
-                };
                 let section = |axis: usize| {
-                    let size = level.temporal[axis].size_a;
-                    let (ends, fraction) = texels(&lines[axis], texel_pair(u[axis], size), n);
-                    TimeLineSegment { ends, fraction, per_unit: texels_per_unit(u[axis], size) }
+                    let (ends, fraction) = texels(&lines[axis], taps[axis], n);
+                    let per_unit = texels_per_unit(u[axis], level.temporal[axis].size_a);
+                    TimeLineSegment { ends, fraction, per_unit }
                 };
-                let [xy, xz, yz] = [patch(0), patch(1), patch(2)];
                 let [xt, yt, zt] = [section(0), section(1), section(2)];
+                let channels_of = |values: &'_ [f32], first: usize| channel_chunk(&values[before..before + n], first);
                 for first in (0..n).step_by(CHANNEL_CHUNK) {
-                    let ([xy, xy_x, xy_y], [xz, xz_x, xz_z]) =
-                        (xy.sample_with_slopes(first), xz.sample_with_slopes(first));
-                    let ([yz, yz_y, yz_z], [xt, xt_x]) = (yz.sample_with_slopes(first), xt.sample_with_slopes(first));
-                    let ([yt, yt_y], [zt, zt_z]) = (yt.sample_with_slopes(first), zt.sample_with_slopes(first));
-                    let mut products = [[0.0; CHANNEL_CHUNK]; 4];
+                    let ([xt, xt_x], [yt, yt_y]) = (xt.sample_with_slopes(first), yt.sample_with_slopes(first));
+                    let [zt, zt_z] = zt.sample_with_slopes(first);
+                    let product = channels_of(product, first);
+                    let space = space.map(|along| channels_of(along, first));
+                    let mut sums = [[0.0; CHANNEL_CHUNK]; 4];
                     for c in 0..CHANNEL_CHUNK {
-                        let (space, time) = (xy[c] * xz[c] * yz[c], xt[c] * yt[c] * zt[c]);
-                        products[0][c] =
-                            time * yz[c] * (xy_x[c] * xz[c] + xy[c] * xz_x[c]) + space * yt[c] * zt[c] * xt_x[c];
-                        products[1][c] =
-                            time * xz[c] * (xy_y[c] * yz[c] + xy[c] * yz_y[c]) + space * xt[c] * zt[c] * yt_y[c];
-                        products[2][c] =
-                            time * xy[c] * (xz_z[c] * yz[c] + xz[c] * yz_z[c]) + space * xt[c] * yt[c] * zt_z[c];
-                        products[3][c] = space * time;
+                        let time = xt[c] * yt[c] * zt[c];
+                        sums[0][c] = time * space[0][c] + product[c] * yt[c] * zt[c] * xt_x[c];
+                        sums[1][c] = time * space[1][c] + product[c] * xt[c] * zt[c] * yt_y[c];
+                        sums[2][c] = time * space[2][c] + product[c] * xt[c] * yt[c] * zt_z[c];
+                        sums[3][c] = product[c] * time;
                     }
                     let channels = before + first..before + n.min(first + CHANNEL_CHUNK);
                     for (axis, out) in slopes.iter_mut().enumerate() {
-                        for (out, product) in out[channels.clone()].iter_mut().zip(products[axis]) {
-                            out.0[lane] = self.space.factor[axis] * product;
+                        for (out, sum) in out[channels.clone()].iter_mut().zip(sums[axis]) {
+                            out.0[lane] = self.space.factor[axis] * sum;
                         }
                     }
-                    for (out, product) in features[channels].iter_mut().zip(products[3]) {
-                        out.0[lane] = product;
+                    for (out, sum) in features[channels].iter_mut().zip(sums[3]) {
+                        out.0[lane] = sum;
                     }
                 }
                 before += n;

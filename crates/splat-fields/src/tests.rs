@@ -308,7 +308,10 @@ fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
 /// with respect to the stored attributes `raw`.
 fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients) -> Gradients {
     let mut pulled = gradients.clone();
-    field.jacobian(raw, &field.prepare(&raw.position), time, gradients.columns()).unwrap().pull_back(&mut pulled);
+    field
+        .jacobian(raw, &field.prepare_with_slopes(&raw.position), time, gradients.columns())
+        .unwrap()
+        .pull_back(&mut pulled);
     pulled
 }
 
@@ -399,16 +402,20 @@ fn derivative_of_masked_positions_is_the_mask() {
 fn derivatives_do_not_depend_on_blocks() {
     let field = build(&FieldConfig { apply_rotation: true, ..plain_config() }, 2);
     let raw = random_gaussians(300);
-    let whole = field.jacobian(&raw, &field.prepare(&raw.position), 0.6, Attributes::all()).unwrap();
+    let whole = field.jacobian(&raw, &field.prepare_with_slopes(&raw.position), 0.6, Attributes::all()).unwrap();
     for block in [1, 16, 37] {
         let rows: Vec<u32> = (0..300).collect();
         for ids in rows.chunks(block) {
             let raw = raw.pick(ids);
-            let found = field.jacobian(&raw, &field.prepare(&raw.position), 0.6, Attributes::all()).unwrap();
+            let found =
+                field.jacobian(&raw, &field.prepare_with_slopes(&raw.position), 0.6, Attributes::all()).unwrap();
             assert!(found == whole.pick(ids), "blocks of {block}");
         }
     }
-    assert!(field.jacobian(&raw, &field.prepare(&raw.position), 0.6, Attributes::SH).unwrap() == Default::default());
+    assert!(
+        field.jacobian(&raw, &field.prepare_with_slopes(&raw.position), 0.6, Attributes::SH).unwrap()
+            == Default::default()
+    );
 }
 
 #[test]

@@ -52,7 +52,7 @@ pub(super) fn derivative() -> CaseResult {
         let field = Field::new(&tensors, config.clone(), 3, Path::new("made up"))?;
         let oracle = Oracle { tensors: &tensors, config: &config };
         let raw = random_gaussians(40);
-        let found = field.jacobian(&raw, &field.prepare(&raw.position), time, Attributes::POSITION)?;
+        let found = field.jacobian(&raw, &field.prepare_with_slopes(&raw.position), time, Attributes::POSITION)?;
         let mut worst = LargestError::default();
         worst.same(&found.column(Attributes::POSITION).width(), &9);
         for i in 0..raw.len() {

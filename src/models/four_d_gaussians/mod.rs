@@ -88,7 +88,7 @@ impl InputModel for ModelFolder {
             // The canonical values of the compressed model, and a copy while they are computed.
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
-            prepared: self.field().bytes_per_gaussian() as u64,
+            prepared: self.field().bytes_per_gaussian_with_slopes() as u64,
             file: whole + 24,
             // Two copies of the field's tensors: as read from the file, and as used.
             fixed: 2 * self.tensor_bytes(),

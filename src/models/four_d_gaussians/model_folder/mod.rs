@@ -293,7 +293,7 @@ impl Deformation for ModelFolder {
     fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a> {
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let position = &stored.gaussians.position;
-        let prepare = |ids: &[u32]| self.field.prepare(&position.pick(ids));
+        let prepare = |ids: &[u32]| self.field.prepare_with_slopes(&position.pick(ids));
         let prepared = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(prepare).collect();
         Box::new(PreparedModel { model: self, stored, ids, prepared })
     }
