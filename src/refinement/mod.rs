@@ -38,7 +38,7 @@ use crate::model::{Attributes, NO_SH_LIMIT};
 use crate::pruning::score::scored_memory;
 use crate::recipe;
 use crate::refinement::optimizer_state::{REEVALUATE_EVERY, StepParams, keyframe_count};
-use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
+use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES, STRIP_BYTES};
 use loss::Loss;
 
 /// Name of the refinement stage in messages and in the cache.
@@ -218,7 +218,9 @@ impl RefineStage {
     fn estimate_for_views(&self, work: &Workload, limits: &Limits, [own, between]: [usize; 2]) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
-        let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
+        // Target views of one frame are rendered together, each by a renderer that keeps its buffers.
+        let together = work.threads.min(limits.views_together as u64);
+        let original = [("states", whole), ("views", together * SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
         // With a deformation field, no reader is open while steps are made. While states are evaluated again, two more
         // states and what the field computes without time are held; while views are rendered, one state per thread and
@@ -289,7 +291,7 @@ impl RefineStage {
             per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![
                 work.block_buffer_memory(),
-                ("pairs", GRADIENT_STRIP_BYTES as u64),
+                ("pairs", (GRADIENT_STRIP_BYTES as u64).max(together * STRIP_BYTES as u64)),
                 ("views", whole_views.max(views_of_steps)),
                 ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),
             ],

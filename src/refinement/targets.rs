@@ -190,7 +190,7 @@ impl Targets {
         let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [RenderedSource::all_gaussians(scene.source())];
             let mut next = some.start;
-            // One renderer per view of a batch; its buffers serve all batches.
+            // One renderer for each view of a batch. All keep their buffers until the last batch.
             let mut renderers: Vec<Renderer> = Vec::new();
             for_each_view_batch(
                 subject,

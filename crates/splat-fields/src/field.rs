@@ -2,9 +2,9 @@
 //! MLP per attribute (the heads).
 //!
 //! Input: tensors of a state dict, stored positions, a time. Output: for each Gaussian the deltas of its attributes,
-//! and a mask that multiplies its stored attributes. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared
-//! Gaussian, and one [`LayerBuffers`] of about 4·LANES·(features + trunk + heads) bytes, where the three names stand
-//! for the widths of these layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering",
+//! and a mask that multiplies its stored attributes. Memory: the tensors; [`Field::bytes_per_gaussian`] per prepared
+//! Gaussian, or [`Field::bytes_per_gaussian_with_slopes`] for derivatives; and one [`LayerBuffers`] of about
+//! 4·LANES·(features + trunk + heads) bytes, where the three names stand for the widths of these layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering",
 //! 2024, and the behavior of its public renderer.
 
 use std::path::Path;
@@ -185,7 +185,8 @@ impl Field {
 
     /// Returns the bytes of memory per Gaussian that the result of [`Field::prepare_with_slopes`] takes.
     pub fn bytes_per_gaussian_with_slopes(&self) -> usize {
-        self.bytes_per_gaussian() + self.planes.as_ref().map_or(0, Planes::slope_bytes_per_gaussian)
+        let planes = self.planes.as_ref().filter(|_| self.needs_slopes());
+        self.bytes_per_gaussian() + planes.map_or(0, Planes::slope_bytes_per_gaussian)
     }
 
     /// Returns the number of multiplications by weights that one evaluation of one Gaussian at one time takes.
@@ -203,7 +204,13 @@ impl Field {
     /// Computes what [`Field::prepare`] does, and the part of the derivatives that does not depend on time, which
     /// [`Field::jacobian`] needs.
     pub fn prepare_with_slopes(&self, position: &AttributeValues) -> PreparedPositions {
-        self.prepare_by(position, Planes::prepare_with_slopes)
+        self.prepare_by(position, if self.needs_slopes() { Planes::prepare_with_slopes } else { Planes::prepare })
+    }
+
+    /// Returns whether [`Field::jacobian`] needs derivatives of plane features: only for positions that the field moves
+    /// without a mask.
+    fn needs_slopes(&self) -> bool {
+        matches!(self.mask, Mask::None) && self.config.deformed_attributes.contains(Attributes::POSITION)
     }
 
     /// Prepares Gaussians at `position`; `sample` computes the part that comes from the planes.
@@ -232,7 +239,7 @@ impl Field {
     ///
     /// [`Deltas::apply`] computes the attributes at `time` from these results: stored value times mask, plus delta.
     ///
-    /// `prepared` is what [`Field::prepare`] returned for the block. `time` is passed to the field unscaled; the
+    /// `prepared` is what [`Field::prepare`] or [`Field::prepare_with_slopes`] returned for the block. `time` is passed to the field unscaled; the
     /// feature planes clamp it to [−1, 1].
     ///
     /// # Errors

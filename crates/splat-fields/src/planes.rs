@@ -105,13 +105,13 @@ pub(super) struct PreparedPlanes {
     /// Position of each Gaussian along x, y and z in the planes over (x, t), (y, t) and (z, t), as two texels and a
     /// weight: `[rows, levels, 3]`, one row per Gaussian.
     pub(super) taps: Vec<TexelPair>,
-    /// Derivatives of `product` with respect to the normalized coordinates: `[rows, 3, width]`, one row per Gaussian with
-    /// the axes x, y and z. Empty if no Jacobian will be computed.
+    /// Derivatives of `product` with respect to the normalized coordinates: `[rows, 3, width]`, for each Gaussian those
+    /// along x, then y, then z. Empty unless [`Planes::prepare_with_slopes`] computed them.
     pub(super) slopes: Vec<f32>,
 }
 
 impl PreparedPlanes {
-    /// Returns whether slopes of `rows` Gaussians were computed, for the planes `planes`.
+    /// Returns whether there are slopes of `rows` Gaussians in planes as wide as `planes`.
     pub(super) fn has_slopes(&self, planes: &Planes, rows: usize) -> bool {
         self.slopes.len() == 3 * planes.width() * rows
     }

@@ -1,7 +1,7 @@
 //! HexPlane features (products of samples of six feature planes) and their derivatives with respect to position.
 //!
-//! Input: stored positions of a group of Gaussians, and the planes with time, interpolated at one time. Output:
-//! features `[Σ channels, LANES]`, and for each of the axes x, y and z as many derivatives. The derivative of a feature
+//! Input: stored positions of a group of Gaussians, what was prepared for them, and the planes with time, interpolated
+//! at one time. Output: features `[Σ channels, LANES]`, and for each of the axes x, y and z as many derivatives. The derivative of a feature
 //! along an axis is a sum of three terms, one for each plane with this axis: the derivative of the sample of this plane
 //! times the other five samples. Coordinates outside the box are clamped, so their derivative is 0. What depends only on
 //! the planes without time is computed once per block of Gaussians ([`Planes::prepare_with_slopes`]).
@@ -161,12 +161,12 @@ impl Planes {
         for out in slopes.iter_mut().chain([&mut *features]) {
             out.resize(width, CacheLine([0.0; LANES]));
         }
-        let blocks = prepared.product[start * width..].chunks_exact(width);
-        let blocks = blocks.zip(prepared.slopes[3 * start * width..].chunks_exact(3 * width));
-        let blocks = blocks.zip(prepared.taps[start * tap_count..].chunks_exact(tap_count));
-        for (lane, (((&x, &y), &z), ((product, space), taps))) in x.iter().zip(y).zip(z).zip(blocks).enumerate() {
+        let rows = prepared.product[start * width..].chunks_exact(width);
+        let rows = rows.zip(prepared.slopes[3 * start * width..].chunks_exact(3 * width));
+        let rows = rows.zip(prepared.taps[start * tap_count..].chunks_exact(tap_count));
+        for (lane, (((&x, &y), &z), ((product, spatial), taps))) in x.iter().zip(y).zip(z).zip(rows).enumerate() {
             let u = self.space.normalized([x, y, z]);
-            let space = [&space[..width], &space[width..2 * width], &space[2 * width..]];
+            let spatial = [0, 1, 2].map(|axis| &spatial[axis * width..][..width]);
             let mut before = 0;
             for ((level, lines), taps) in self.levels.iter().zip(lines).zip(taps.chunks_exact(3)) {
                 let n = level.channels;
@@ -176,28 +176,28 @@ impl Planes {
                     TimeLineSegment { ends, fraction, per_unit }
                 };
                 let [xt, yt, zt] = [section(0), section(1), section(2)];
-                let channels_of = |values: &'_ [f32], first: usize| channel_chunk(&values[before..before + n], first);
                 for first in (0..n).step_by(CHANNEL_CHUNK) {
                     let ([xt, xt_x], [yt, yt_y]) = (xt.sample_with_slopes(first), yt.sample_with_slopes(first));
                     let [zt, zt_z] = zt.sample_with_slopes(first);
-                    let product = channels_of(product, first);
-                    let space = space.map(|along| channels_of(along, first));
-                    let mut sums = [[0.0; CHANNEL_CHUNK]; 4];
+                    // Values beyond this level are not used.
+                    let product = channel_chunk(product, before + first);
+                    let spatial = spatial.map(|values| channel_chunk(values, before + first));
+                    let (mut along, mut feature) = ([[0.0; CHANNEL_CHUNK]; 3], [0.0; CHANNEL_CHUNK]);
                     for c in 0..CHANNEL_CHUNK {
                         let time = xt[c] * yt[c] * zt[c];
-                        sums[0][c] = time * space[0][c] + product[c] * yt[c] * zt[c] * xt_x[c];
-                        sums[1][c] = time * space[1][c] + product[c] * xt[c] * zt[c] * yt_y[c];
-                        sums[2][c] = time * space[2][c] + product[c] * xt[c] * yt[c] * zt_z[c];
-                        sums[3][c] = product[c] * time;
+                        along[0][c] = time * spatial[0][c] + product[c] * yt[c] * zt[c] * xt_x[c];
+                        along[1][c] = time * spatial[1][c] + product[c] * xt[c] * zt[c] * yt_y[c];
+                        along[2][c] = time * spatial[2][c] + product[c] * xt[c] * yt[c] * zt_z[c];
+                        feature[c] = product[c] * time;
                     }
                     let channels = before + first..before + n.min(first + CHANNEL_CHUNK);
                     for (axis, out) in slopes.iter_mut().enumerate() {
-                        for (out, sum) in out[channels.clone()].iter_mut().zip(sums[axis]) {
-                            out.0[lane] = self.space.factor[axis] * sum;
+                        for (out, slope) in out[channels.clone()].iter_mut().zip(along[axis]) {
+                            out.0[lane] = self.space.factor[axis] * slope;
                         }
                     }
-                    for (out, sum) in features[channels].iter_mut().zip(sums[3]) {
-                        out.0[lane] = sum;
+                    for (out, feature) in features[channels].iter_mut().zip(feature) {
+                        out.0[lane] = feature;
                     }
                 }
                 before += n;

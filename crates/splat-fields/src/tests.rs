@@ -208,6 +208,15 @@ fn a_zero_quaternion_product_stays_zero() {
 fn an_empty_block_is_empty() {
     let field = build(&plain_config(), 1);
     assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Attributes::all()).0.is_empty());
+    let none = Gaussians::zeros(0, 3);
+    let empty = field.jacobian(&none, &field.prepare_with_slopes(&none.position), 0.5, Attributes::POSITION).unwrap();
+    assert!(empty.column(Attributes::POSITION).is_empty());
+}
+
+#[test]
+fn jacobian_of_a_block_without_slopes_is_an_error() {
+    let (field, some) = (build(&plain_config(), 1), random_gaussians(3));
+    assert!(field.jacobian(&some, &field.prepare(&some.position), 0.5, Attributes::POSITION).is_err());
 }
 
 /// Returns the error message of building a field from tensors that `change` has altered.

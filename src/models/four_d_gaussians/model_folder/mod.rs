@@ -3,7 +3,8 @@
 //! Input: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, frame times. Output: states of any
 //! Gaussians at any frame. Memory: the canonical Gaussians (44 + 12·(d+1)² bytes per Gaussian at SH degree d) and the
 //! tensors of the field. Each open reader takes in addition a copy of the canonical Gaussians that it reads, and
-//! [`Field::bytes_per_gaussian`] per Gaussian.
+//! [`Field::bytes_per_gaussian`] per Gaussian. [`Deformation::with_params`] takes
+//! [`Field::bytes_per_gaussian_with_slopes`] per Gaussian.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
