@@ -37,7 +37,7 @@ const MOST_VIEWS: usize = 60;
 const FEWEST_VIEWS: usize = 4;
 /// Fraction of the run's estimated processor time that measuring quality may take. The goal is 3% of the measured time.
 /// The fraction is lower because the estimates of other stages were up to 1.6 times too high.
-const MAX_TIME_FRACTION: f64 = 0.016;
+const MAX_TIME_FRACTION: f64 = 0.014;
 /// Assumed maximum number of times that the stage reads the frames of the measured views, for the estimate of its
 /// reads: for the original, for the result (whose frames are computed from the same input) and for the timed views.
 const READS: f64 = 2.5;
