@@ -235,8 +235,8 @@ fn check_accuracy(state: &Gaussians, unit: f64) -> Result<SpzErrors> {
     }
     for column in 3..state.sh.width() {
         let values = state.sh.plane(column);
-        // Values from −1 to 1 have errors below 0.07, far within the bound of 1. NaN counts as out of range. The operator
-        // `&` instead of `all`: a loop without an early exit is vectorized.
+        // The error of a value from −1 to 1 is below 0.07, and the bound is 1, so these values need no check. NaN does.
+        // `&` makes a loop without early exit, which the compiler vectorizes; `all` does not.
         if values.iter().fold(true, |are_in_range, value| are_in_range & (value.abs() <= 1.0)) {
             continue;
         }

@@ -113,8 +113,8 @@ const MIN_WEIGHT: f64 = 1e-3;
 /// [`HOPELESS`].
 const FIRST_UPDATES: usize = 4;
 /// Multiple of the tolerance. Overlapping curves whose error is above it after [`FIRST_UPDATES`] iterations are skipped,
-/// because more iterations rarely reduce the error by this factor. If no other curves meet the tolerance, skipped ones
-/// are fitted to the end after all.
+/// because more iterations rarely reduce the error by this factor. Only if no curves meet the tolerance, the skipped
+/// ones are fitted with all iterations.
 const HOPELESS: f64 = 2.0;
 
 /// Returns curves of the form `form` that represent `track`, the states of a Gaussian at all frames. Tries increasing
@@ -156,8 +156,8 @@ fn depth(opacity: f64) -> f64 {
     -ln(1.0 - opacity.clamp(0.0, MAX_OPACITY))
 }
 
-/// Search for curves that represent one track. An attempt fits a certain number of curves and measures their error. This
-/// struct holds the values that all attempts share, and the best curves so far.
+/// Search for curves that represent one track. Each attempt of the search fits a certain number of curves and measures
+/// their error. Holds the values that all attempts use, and the best curves so far.
 struct TrackFit<'a> {
     track: &'a FittedTrack,
     form: CurveForm,

@@ -25,8 +25,8 @@ pub struct FittedTrack {
 
 impl FittedTrack {
     /// Returns the track (states at all frames) of the Gaussian in row `row` of `states`. `states` holds all Gaussians
-    /// at each of the `times`. `has_varying_sh`: whether SH coefficients may differ between the states; if not, only
-    /// those of the first state are read.
+    /// at each of the `times`. `has_varying_sh` states whether SH coefficients may differ between the states. If it is
+    /// false, only the SH coefficients of the first state are read.
     pub fn from_states(times: &[f64], states: &[Gaussians], row: usize, has_varying_sh: bool) -> FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];

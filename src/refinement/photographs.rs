@@ -58,13 +58,13 @@ impl RefineStage {
         need
     }
 
-    /// Fits the model `reduction` to photographs and to renders of the original. The target views are the views `seen`
-    /// from the scene's cameras, whose photographs are in `photographs`, and views from new cameras, which are renders.
-    /// Some photographs are held back for validation (see [`Targets::with_photographs`]). Returns the state of the model
-    /// with the highest PSNR against the photographs that are held back. This may be `reduction` itself.
+    /// Fits the model `reduction` to photographs and to renders of the original. There are two kinds of target views:
+    /// photographs (`photographs`) of the views `seen` from the scene's cameras, and renders from new cameras. Some
+    /// photographs are used for validation only (see [`Targets::with_photographs`]). Returns the state of the model with
+    /// the highest PSNR on these validation photographs; this may be `reduction` itself.
     ///
-    /// Records in `journal` the PSNR against the photographs that are held back, before and after the fit. If the fit did
-    /// not raise it, records the reason instead.
+    /// Records in `journal` the PSNR on the validation photographs before and after the fit. If the fit did not raise
+    /// it, records the reason instead.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if a scratch file cannot be written.

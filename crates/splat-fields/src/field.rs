@@ -2,10 +2,12 @@
 //! MLP per attribute (the heads).
 //!
 //! Input: tensors of a state dict, stored positions, a time. Output: for each Gaussian the deltas of its attributes,
-//! and a mask that multiplies its stored attributes. Memory: the tensors; [`Field::bytes_per_gaussian`] per prepared
-//! Gaussian, or [`Field::bytes_per_gaussian_with_slopes`] for derivatives; and one [`LayerBuffers`] of about
-//! 4·LANES·(features + trunk + heads) bytes, where the three names stand for the widths of these layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering",
-//! 2024, and the behavior of its public renderer.
+//! and a mask that multiplies its stored attributes.
+//!
+//! Memory: the tensors; one [`LayerBuffers`] of about 4·LANES·(features + trunk + heads) bytes, where the three names
+//! stand for the widths of these layers; and for each prepared Gaussian [`Field::bytes_per_gaussian`], or
+//! [`Field::bytes_per_gaussian_with_slopes`] if its Jacobian is computed. Source: Wu et al., "4D Gaussian Splatting for
+//! Real-Time Dynamic Scene Rendering", 2024, and the behavior of its public renderer.
 
 use std::path::Path;
 
@@ -198,31 +200,10 @@ impl Field {
     /// Computes the part of the evaluation that does not depend on time, for Gaussians at the stored positions
     /// `position` (`[3, N]`).
     pub fn prepare(&self, position: &AttributeValues) -> PreparedPositions {
-        self.prepare_by(position, Planes::prepare)
-    }
-
-    /// Computes what [`Field::prepare`] does, and the part of the derivatives that does not depend on time, which
-    /// [`Field::jacobian`] needs.
-    pub fn prepare_with_slopes(&self, position: &AttributeValues) -> PreparedPositions {
-        self.prepare_by(position, if self.needs_slopes() { Planes::prepare_with_slopes } else { Planes::prepare })
-    }
-
-    /// Returns whether [`Field::jacobian`] needs derivatives of plane features: only for positions that the field moves
-    /// without a mask.
-    fn needs_slopes(&self) -> bool {
-        matches!(self.mask, Mask::None) && self.config.deformed_attributes.contains(Attributes::POSITION)
-    }
-
-    /// Prepares Gaussians at `position`; `sample` computes the part that comes from the planes.
-    fn prepare_by(
-        &self,
-        position: &AttributeValues,
-        sample: fn(&Planes, &AttributeValues) -> PreparedPlanes,
-    ) -> PreparedPositions {
         PreparedPositions {
             rows: position.len(),
             input: match &self.planes {
-                Some(planes) => PreparedInput::Planes(sample(planes, position)),
+                Some(planes) => PreparedInput::Planes(planes.prepare(position)),
                 None => PreparedInput::Position(position.clone()),
             },
             voxel: match &self.mask {
@@ -232,6 +213,24 @@ impl Field {
         }
     }
 
+    /// Prepares a block of Gaussians for [`Field::jacobian`] as well as for [`Field::deltas`]: computes the result of
+    /// [`Field::prepare`], and the part of the derivatives that does not depend on time.
+    pub fn prepare_with_slopes(&self, position: &AttributeValues) -> PreparedPositions {
+        let mut prepared = self.prepare(position);
+        if let (Some(planes), PreparedInput::Planes(block)) = (&self.planes, &mut prepared.input)
+            && self.needs_slopes()
+        {
+            block.slopes = planes.slopes_in_space(position);
+        }
+        prepared
+    }
+
+    /// Returns whether [`Field::jacobian`] needs derivatives of plane features. It needs them only if the field moves
+    /// positions and has no mask.
+    fn needs_slopes(&self) -> bool {
+        matches!(self.mask, Mask::None) && self.config.deformed_attributes.contains(Attributes::POSITION)
+    }
+
     /// Evaluates the field at `time` for the Gaussians of a prepared block. Writes two results to `out`:
     /// - the deltas of those attributes in `want` that the field changes; deltas of other attributes in `out` stay
     ///   unchanged;
@@ -239,8 +238,8 @@ impl Field {
     ///
     /// [`Deltas::apply`] computes the attributes at `time` from these results: stored value times mask, plus delta.
     ///
-    /// `prepared` is what [`Field::prepare`] or [`Field::prepare_with_slopes`] returned for the block. `time` is passed to the field unscaled; the
-    /// feature planes clamp it to [−1, 1].
+    /// `prepared` is what [`Field::prepare`] or [`Field::prepare_with_slopes`] returned for the block. `time` is passed to
+    /// the field unscaled; the feature planes clamp it to [−1, 1].
     ///
     /// # Errors
     /// Fails if `time` is not finite, or if `out` has another SH degree than the field.

@@ -4,9 +4,11 @@
 //! state = raw + delta(position, time), so ∂state/∂raw of a position is the identity plus ∂delta/∂position. For each of
 //! the three components, ∂delta/∂position is computed by a backward pass through the head (MLP of the position), the
 //! trunk (MLP shared by all attributes) and the feature planes. Derivatives through the deltas of other attributes are
-//! neglected: they would raise the quality of refined models by less than 0.1 dB, and take most of the time. Input: raw
-//! positions and rotations, and what [`Field::prepare_with_slopes`] computed from the positions. Output: a [`Jacobian`]. Memory: the Jacobian, and the values of all layers for one group of
-//! [`LANES`] Gaussians. Derived in docs/method.md, section 8.2.
+//! neglected: they would raise the quality of refined models by less than 0.1 dB, and take most of the time.
+//!
+//! Input: raw positions and rotations, and what [`Field::prepare_with_slopes`] computed from the positions. Output: a
+//! [`Jacobian`]. Memory: the Jacobian, and the values of all layers for one group of [`LANES`] Gaussians. Derived in
+//! docs/method.md, section 8.2.
 
 use super::deltas::{Deltas, finite};
 use super::field::{

@@ -106,7 +106,7 @@ pub(super) struct PreparedPlanes {
     /// weight: `[rows, levels, 3]`, one row per Gaussian.
     pub(super) taps: Vec<TexelPair>,
     /// Derivatives of `product` with respect to the normalized coordinates: `[rows, 3, width]`, for each Gaussian those
-    /// along x, then y, then z. Empty unless [`Planes::prepare_with_slopes`] computed them.
+    /// along x, then y, then z ([`Planes::slopes_in_space`]). Empty if no Jacobian is computed.
     pub(super) slopes: Vec<f32>,
 }
 

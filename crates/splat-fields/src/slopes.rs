@@ -1,10 +1,11 @@
 //! HexPlane features (products of samples of six feature planes) and their derivatives with respect to position.
 //!
 //! Input: stored positions of a group of Gaussians, what was prepared for them, and the planes with time, interpolated
-//! at one time. Output: features `[Σ channels, LANES]`, and for each of the axes x, y and z as many derivatives. The derivative of a feature
-//! along an axis is a sum of three terms, one for each plane with this axis: the derivative of the sample of this plane
-//! times the other five samples. Coordinates outside the box are clamped, so their derivative is 0. What depends only on
-//! the planes without time is computed once per block of Gaussians ([`Planes::prepare_with_slopes`]).
+//! at one time. Output: features `[Σ channels, LANES]`, and their derivatives along x, y and z, three arrays of this
+//! size. The derivative of a feature along an axis is a sum of three terms, one for each plane with this axis: the
+//! derivative of the sample of this plane times the other five samples. Coordinates outside the box are clamped, so
+//! their derivative is 0. What depends only on the planes without time is computed once per block of Gaussians
+//! ([`Planes::slopes_in_space`]).
 
 use super::linear::{CacheLine, LANES};
 use super::planes::{FeaturePlane, Planes, PreparedPlanes, SPATIAL, TimeLines, texel_pair, texels};
@@ -106,13 +107,12 @@ impl TimeLineSegment<'_> {
 }
 
 impl Planes {
-    /// Computes the part of the features and of their derivatives that does not depend on time, for Gaussians at the
-    /// stored positions `position` (`[3, N]`).
-    pub(super) fn prepare_with_slopes(&self, position: &AttributeValues) -> PreparedPlanes {
+    /// Returns the derivatives of the product of the samples of the three planes without time, with respect to the
+    /// normalized coordinates: `[N, 3, width]`, for Gaussians at the stored positions `position` (`[3, N]`).
+    pub(super) fn slopes_in_space(&self, position: &AttributeValues) -> Vec<f32> {
         let width = self.width();
-        let mut prepared = self.prepare(position);
-        prepared.slopes = vec![0.0; 3 * width * position.len()];
-        for (i, row) in prepared.slopes.chunks_exact_mut(3 * width).enumerate() {
+        let mut slopes = vec![0.0; 3 * width * position.len()];
+        for (i, row) in slopes.chunks_exact_mut(3 * width).enumerate() {
             let u = self.space.normalized(position.row(i));
             let mut before = 0;
             for level in &self.levels {
@@ -136,15 +136,14 @@ impl Planes {
                 before += n;
             }
         }
-        prepared
+        slopes
     }
 
     /// Computes the plane features of up to [`LANES`] Gaussians at one time, and their derivatives with respect to the
     /// position.
     ///
     /// - `x`, `y`, `z`: positions of the Gaussians, scene units.
-    /// - `prepared`: block that [`Planes::prepare_with_slopes`] returned; `start` is the index of the first of these
-    ///   Gaussians in it.
+    /// - `prepared`: block that was prepared with slopes; `start` is the index in it of the first of these Gaussians.
     /// - `lines`: the planes with a time axis, interpolated at this time ([`Planes::lines`]).
     /// - `features`: receives the features. Values of unused lanes are unspecified.
     /// - `slopes`: receives the derivatives of the features with respect to x, y and z.

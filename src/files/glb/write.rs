@@ -136,7 +136,8 @@ fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
     all
 }
 
-/// Returns an attribute of `N` f32 values per Gaussian. `value` returns the values of the Gaussian with a given index.
+/// Returns an attribute named `name` with `N` f32 values per Gaussian and the glTF type `kind`. `value` returns the
+/// values of the Gaussian with a given index.
 fn floats<'a, const N: usize>(
     name: String,
     kind: &'static str,

@@ -168,9 +168,10 @@ impl QualityStage {
         Ok(Some(QualitySummary { kind, views: views.len(), psnr, ssim: Some(ssim), render_ms }))
     }
 
-    /// Returns the number of views on which quality is measured: [`MOST_VIEWS`], or fewer if these and the timed renders
-    /// would take more than the fraction [`MAX_TIME_FRACTION`] of the time of the run, but at least [`FEWEST_VIEWS`].
-    /// Times are estimates for a reference machine, so that the number of views is the same on every machine.
+    /// Returns the number of views on which quality is measured, from [`FEWEST_VIEWS`] to [`MOST_VIEWS`]. Within these
+    /// limits it is the largest number for which measuring, timed renders included, takes at most the fraction
+    /// [`MAX_TIME_FRACTION`] of the time of the run. Times are estimates for a reference machine, so that the number of
+    /// views is the same on every machine.
     fn view_count(&self, run: &RunState<'_>) -> usize {
         let scene = run.scene;
         let work = Workload { throughput: Throughput::UNKNOWN, ..scene.workload() };
