@@ -267,9 +267,9 @@ impl RefineStage {
                 true => (steps, validation_renders, 0.0),
                 false => (self.steps_before(size, left), RATE_VIEWS as f64, RANKING_VIEWS as f64),
             };
-            // Evaluating states and their Jacobians under a deformation field takes three times as long as evaluating
+            // Evaluating states and their Jacobians under a deformation field takes twice as long as evaluating
             // states.
-            let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
+            let found = if work.input.jacobian > 0 { 2.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
             let strided = work.on_grid(self.stride(work.pixels, count as usize));
             work.reading_seconds(count, frames as f64 * found)
                 + work.render_seconds(renders, count, RENDER_COST)
