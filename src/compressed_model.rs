@@ -125,10 +125,10 @@ pub struct TrajectoryDelta(pub Vec<ParamDelta>);
 
 impl TrajectoryDelta {
     /// Returns the two keyframes between which frame `frame` of a sequence of `frames` frames lies. Each is given by
-    /// its index and its weight in the linear interpolation. `knots`: number of keyframes, at least 2.
-    pub fn keyframe_weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
-        let along = frame as f64 * (knots - 1) as f64 / (frames.max(2) - 1) as f64;
-        let first = (along as usize).min(knots - 2);
+    /// its index and its weight in the linear interpolation. `keyframes`: number of keyframes, at least 2.
+    pub fn keyframe_weights(keyframes: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
+        let along = frame as f64 * (keyframes - 1) as f64 / (frames.max(2) - 1) as f64;
+        let first = (along as usize).min(keyframes - 2);
         let part = (along - first as f64) as f32;
         [(first, 1.0 - part), (first + 1, part)]
     }
@@ -150,7 +150,7 @@ impl TrajectoryDelta {
             return ParamDelta::default();
         }
         let [(first, before), (second, after)] = TrajectoryDelta::keyframe_weights(self.0.len(), frame, frames);
-        let [mut change, mut more] = [first, second].map(|knot| self.0[knot].clone());
+        let [mut change, mut more] = [first, second].map(|keyframe| self.0[keyframe].clone());
         change.scale(before);
         more.scale(after);
         change.plus(more)
@@ -158,7 +158,7 @@ impl TrajectoryDelta {
 
     /// Returns the trajectory delta of the Gaussians at the output indices `places`, in the order of `places`.
     pub fn pick(&self, places: &[u32]) -> TrajectoryDelta {
-        TrajectoryDelta(self.0.iter().map(|knot| knot.pick(places)).collect())
+        TrajectoryDelta(self.0.iter().map(|keyframe| keyframe.pick(places)).collect())
     }
 
     /// Returns the sum of this trajectory delta and `more`. If both have keyframes, their numbers of keyframes must be
@@ -167,7 +167,7 @@ impl TrajectoryDelta {
         match (self.is_empty(), more.is_empty()) {
             (_, true) => self,
             (true, _) => more,
-            _ => TrajectoryDelta(self.0.into_iter().zip(more.0).map(|(knot, more)| knot.plus(more)).collect()),
+            _ => TrajectoryDelta(self.0.into_iter().zip(more.0).map(|(keyframe, more)| keyframe.plus(more)).collect()),
         }
     }
 }
@@ -320,20 +320,23 @@ mod tests {
 
     #[test]
     fn trajectory_delta_is_linear_between_keyframes() {
-        let knot = |x: f32, logit: f32| {
+        let keyframe = |x: f32, logit: f32| {
             let mut by = Gaussians::zeros(0, 0);
             by.position = AttributeValues::from_planes(3, vec![x, 0.0, 2.0 * x, 0.0, 0.0, -x]);
             by.opacity_logit = AttributeValues::from_planes(1, vec![logit, 1.0]);
             ParamDelta(by)
         };
-        let course = TrajectoryDelta(vec![knot(1.0, 0.0), knot(3.0, 4.0), knot(-1.0, 4.0)]);
+        let course = TrajectoryDelta(vec![keyframe(1.0, 0.0), keyframe(3.0, 4.0), keyframe(-1.0, 4.0)]);
         assert_eq!(course.attributes(), Attributes::POSITION | Attributes::OPACITY);
         for (frame, x, logit) in [(0, 1.0, 0.0), (1, 1.5, 1.0), (4, 3.0, 4.0), (7, 0.0, 4.0), (8, -1.0, 4.0)] {
-            assert_eq!(course.at_frame(frame, 9), knot(x, logit), "frame {frame}");
-            assert_eq!(course.pick(&[1, 0, 1]).at_frame(frame, 9), knot(x, logit).pick(&[1, 0, 1]));
-            assert_eq!(course.clone().plus(course.clone()).at_frame(frame, 9), knot(x, logit).plus(knot(x, logit)));
+            assert_eq!(course.at_frame(frame, 9), keyframe(x, logit), "frame {frame}");
+            assert_eq!(course.pick(&[1, 0, 1]).at_frame(frame, 9), keyframe(x, logit).pick(&[1, 0, 1]));
+            assert_eq!(
+                course.clone().plus(course.clone()).at_frame(frame, 9),
+                keyframe(x, logit).plus(keyframe(x, logit))
+            );
         }
-        assert_eq!(course.at_frame(0, 1), knot(1.0, 0.0));
+        assert_eq!(course.at_frame(0, 1), keyframe(1.0, 0.0));
         assert!(
             TrajectoryDelta::default().at_frame(3, 9).is_empty()
                 && TrajectoryDelta::default().plus(course.clone()) == course

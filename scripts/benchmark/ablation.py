@@ -18,16 +18,16 @@ from error_against_time import VISIBLE
 from measuring import KEPT, Results, arguments, chosen, compress, evaluate, words
 
 PRUNE = ["--no-refine", "--prune-only"]
-ROUNDS_OF_48_VIEWS = ["round_pictures=48", "round_turns=4"]
+ROUNDS_OF_48_VIEWS = ["round_views=48", "round_groups=4"]
 SETTINGS = {
     "default": [],
     "contrast_floor=0": ["contrast_floor=0"],
     "contrast_floor=0.3": ["contrast_floor=0.3"],
-    "round_pictures=48, round_turns=4": ROUNDS_OF_48_VIEWS,
+    "round_views=48, round_groups=4": ROUNDS_OF_48_VIEWS,
     "round_fraction=0.8": ["round_fraction=0.8"],
     "round_fraction=0.95": ["round_fraction=0.95"],
-    "refine_cut_steps=120": ["refine_cut_steps=120"],
-    "refine_pictures=260": ["refine_pictures=260"],
+    "refine_steps_per_prune=120": ["refine_steps_per_prune=120"],
+    "refine_target_views=260": ["refine_target_views=260"],
     "refine_ssim=0.5": ["refine_ssim=0.5"],
     "bands=0": ["bands=0"],
 }
@@ -47,7 +47,7 @@ def stages(kept):
         "removal error, one ranking": [*PRUNE, *sets(f"round_fraction={fraction}")],
         "pruning rounds": PRUNE,
         "merging": ["--no-refine"],
-        "refinement at the target count": sets("refine_cut_steps=0"),
+        "refinement at the target count": sets("refine_steps_per_prune=0"),
         "default": [],
         "default, colors refined only": sets("refine=color"),
         "default, exact field": sets("field=exact"),

@@ -5,7 +5,7 @@
     python3 scripts/benchmark/keyframes.py target/release/splatsieve DATA [--models A,B] [--kept 20%,5%]
 
 Every model is stored as a container of its frames first. Then the container is compressed with deltas that are constant
-in time (refine_knots=0), and with deltas that change linearly between 5 keyframes, the default. PSNR is the mean over
+in time (refine_keyframes=0), and with deltas that change linearly between 5 keyframes, the default. PSNR is the mean over
 test views, against renders of the unpruned model; "temporal" is the temporal error that `evaluate` states.
 """
 
@@ -28,7 +28,7 @@ def main():
             sequence = replace(model, path=frames, photographs=None, options=())
             for fraction in args.kept:
                 for keyframes in (0, 5):
-                    options = ["--ratio", fraction, "--set", f"refine_knots={keyframes}"]
+                    options = ["--ratio", fraction, "--set", f"refine_keyframes={keyframes}"]
                     _, cost = compress(args.program, sequence, output, *options)
                     quality = evaluate(args.program, sequence, output)
                     results.add(

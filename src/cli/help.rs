@@ -89,7 +89,7 @@ const COMMAND_EXAMPLES: &[(&str, &[&str])] = &[
         "precision",
         &[
             "splatsieve precision model --cameras data -o page    error against run time",
-            "splatsieve precision model -o page --knobs look,rounds",
+            "splatsieve precision model -o page --knobs scoring,rounds",
         ],
     ),
     (

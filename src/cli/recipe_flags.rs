@@ -285,8 +285,8 @@ mod tests {
     fn effort_changes_the_preset_before_single_parameters() {
         let default = parse(&[]).unwrap();
         assert_eq!(parse(&["--effort", "default"]).unwrap(), default);
-        let best = parse(&["--effort", "best", "--set", "round_pictures=7"]).unwrap();
-        assert_eq!(best.select.round_pictures, 7);
+        let best = parse(&["--effort", "best", "--set", "round_views=7"]).unwrap();
+        assert_eq!(best.select.round_views, 7);
         assert!(best.refine.refine_steps > default.refine.refine_steps);
         assert!(parse(&["--effort", "luck"]).is_err());
     }

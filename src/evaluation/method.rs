@@ -141,8 +141,8 @@ mod tests {
         };
         assert_eq!(recipe(preset.refine.refine_steps), preset);
         let half = recipe(preset.refine.refine_steps / 2).refine;
-        assert_eq!(half.refine_cut_steps, preset.refine.refine_cut_steps / 2);
-        assert_eq!(recipe(0).refine.refine_cut_steps, 0);
+        assert_eq!(half.refine_steps_per_prune, preset.refine.refine_steps_per_prune / 2);
+        assert_eq!(recipe(0).refine.refine_steps_per_prune, 0);
         assert!(preset.with_parameter("refine", STEPS, "1").is_ok(), "{STEPS} is no parameter");
     }
 }

@@ -72,14 +72,14 @@ impl ViewSampler {
 /// Returns the views of `schedule` that a scoring pass with the parameters `scan` renders.
 ///
 /// A [`ViewSampler`] selects views by the strides of `scan`. If they are more than the maximum in `scan`
-/// (`look_pictures`, where 0 stands for no maximum), [`select_evenly_over_frames`] selects this maximum number of them,
+/// ([`recipe::ScanParams::scoring_views`], where 0 stands for no maximum), [`select_evenly_over_frames`] selects this maximum number of them,
 /// from at least `frames` frames if possible.
 pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
     let left = ViewSampler::new(scan).thin(schedule);
-    if scan.look_pictures == 0 || left.pair_count() <= scan.look_pictures {
+    if scan.scoring_views == 0 || left.pair_count() <= scan.scoring_views {
         return left.frame_views().collect();
     }
-    select_evenly_over_frames(&left, scan.look_pictures, frames)
+    select_evenly_over_frames(&left, scan.scoring_views, frames)
 }
 
 /// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians are alive (opacity ≥
@@ -214,10 +214,13 @@ mod tests {
 
     #[test]
     fn selection_is_strided_then_limited() {
-        let taken = |look_pictures: usize, view_stride: u32| {
+        let taken = |most: usize, view_stride: u32| {
             let view_stride = std::num::NonZeroU32::new(view_stride).unwrap();
-            let scan =
-                recipe::ScanParams { look_pictures, view_stride, ..recipe::Recipe::preset("paper").unwrap().scan };
+            let scan = recipe::ScanParams {
+                scoring_views: most,
+                view_stride,
+                ..recipe::Recipe::preset("paper").unwrap().scan
+            };
             scoring_views(&schedule(60, 12), &scan, 1)
         };
         assert_eq!(

@@ -400,7 +400,7 @@ mod tests {
                 ["time-varying deltas of refinement", "refinement of SH coefficients above degree 0", "refinement"];
             let [time, bands, all] = whats.map(left_out);
             assert_eq!(
-                plan.refine.as_ref().is_some_and(|refine| refine.knots > 0),
+                plan.refine.as_ref().is_some_and(|refine| refine.keyframes > 0),
                 plan.fallback == MemoryFallback::Nothing
             );
             (plan.fallback, plan.refine.map(|refine| refine.sh_degree), time.filter(|_| bands.is_none()).or(bands), all)

@@ -108,7 +108,7 @@ impl SearchStage {
         Some(SearchStage {
             quality: quality.clone(),
             searched,
-            pictures: request.recipe.refine.refine_pictures,
+            pictures: request.recipe.refine.refine_target_views,
             refine: planning.refine.clone(),
             fits_photographs: request.photographs.is_some(),
             margins: [field, bands],

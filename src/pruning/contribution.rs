@@ -140,7 +140,7 @@ mod tests {
             pixel_stride,
             view_stride,
             frame_stride,
-            look_pictures: 0,
+            scoring_views: 0,
             ..Recipe::preset("default").unwrap().scan
         }
     }

@@ -52,7 +52,7 @@ impl VisibilityStage {
             work.view_pass_memory(limits, Attributes::all().difference(Attributes::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
         let strided = work.pictures as f64 / every;
-        let max_views = match self.recipe.look_pictures {
+        let max_views = match self.recipe.scoring_views {
             0 => f64::INFINITY,
             max_views => max_views as f64,
         };
@@ -81,7 +81,7 @@ impl VisibilityStage {
     /// Returns whether the views of a frame can be chosen as soon as the frame has been read. This is so if the number
     /// of views is not limited. Otherwise views can be chosen only after the last frame.
     pub fn can_render_on_arrival(&self) -> bool {
-        self.recipe.look_pictures == 0
+        self.recipe.scoring_views == 0
     }
 
     /// Renders views of `scene` and returns the contribution C and the peak W of every Gaussian. `life`: number of

@@ -17,9 +17,9 @@ pub enum Effort {
 /// Values that an effort (`fast` or `best`) gives to parameters of the recipe; the fields are named like the
 /// parameters.
 struct EffortSettings {
-    look_pictures: usize,
-    round_pictures: usize,
-    round_turns: usize,
+    scoring_views: usize,
+    round_views: usize,
+    round_groups: usize,
     round_fraction: f64,
     /// Factor by which the recipe's number of optimization steps is multiplied.
     steps: f64,
@@ -41,17 +41,17 @@ impl Effort {
     fn settings(self) -> Option<EffortSettings> {
         match self {
             Effort::Fast => Some(EffortSettings {
-                look_pictures: 50,
-                round_pictures: 24,
-                round_turns: 3,
+                scoring_views: 50,
+                round_views: 24,
+                round_groups: 3,
                 round_fraction: 0.85,
                 steps: 1.0 / 3.0,
             }),
             Effort::Default => None,
             Effort::Best => Some(EffortSettings {
-                look_pictures: 400,
-                round_pictures: 144,
-                round_turns: 4,
+                scoring_views: 400,
+                round_views: 144,
+                round_groups: 4,
                 round_fraction: 0.95,
                 steps: 3.0,
             }),
@@ -69,13 +69,13 @@ impl Recipe {
         // Effort `fast` never raises a value of the recipe, and effort `best` never lowers one.
         let less = settings.steps < 1.0;
         let limited = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
-        if recipe.scan.look_pictures > 0 {
-            recipe.scan.look_pictures = limited(recipe.scan.look_pictures, settings.look_pictures);
+        if recipe.scan.scoring_views > 0 {
+            recipe.scan.scoring_views = limited(recipe.scan.scoring_views, settings.scoring_views);
         }
         if recipe.select.round_fraction < 1.0 {
             let select = &mut recipe.select;
-            select.round_pictures = limited(select.round_pictures, settings.round_pictures);
-            select.round_turns = select.round_turns.min(settings.round_turns);
+            select.round_views = limited(select.round_views, settings.round_views);
+            select.round_groups = select.round_groups.min(settings.round_groups);
             let own = select.round_fraction;
             select.round_fraction =
                 if less { own.min(settings.round_fraction) } else { own.max(settings.round_fraction) };
@@ -94,8 +94,8 @@ mod tests {
         let at = Effort::ALL.map(|effort| default.with_effort(effort));
         assert_eq!(at[1], default);
         let rising = |value: fn(&Recipe) -> f64| at.iter().map(value).is_sorted_by(|a, b| a < b);
-        assert!(rising(|recipe| recipe.scan.look_pictures as f64));
-        assert!(rising(|recipe| recipe.select.round_pictures as f64));
+        assert!(rising(|recipe| recipe.scan.scoring_views as f64));
+        assert!(rising(|recipe| recipe.select.round_views as f64));
         assert!(rising(|recipe| recipe.select.round_fraction));
         assert!(rising(|recipe| recipe.refine.refine_steps.into()));
         at.iter().for_each(|recipe| recipe.validate().unwrap());

@@ -112,9 +112,9 @@ impl Recipe {
     pub fn with_refinement_steps(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;
-        let before_cuts = u64::from(refine.refine_cut_steps) * u64::from(steps);
-        let before_cuts = before_cuts.div_ceil(u64::from(refine.refine_steps.max(1)));
-        refine.refine_cut_steps = before_cuts.try_into().unwrap_or(u32::MAX);
+        let per_prune = (u64::from(refine.refine_steps_per_prune) * u64::from(steps))
+            .div_ceil(u64::from(refine.refine_steps.max(1)));
+        refine.refine_steps_per_prune = per_prune.try_into().unwrap_or(u32::MAX);
         refine.refine_steps = steps;
         recipe
     }
@@ -134,6 +134,7 @@ impl Recipe {
         let weight = |x: f64| (0.0..=1e6).contains(&x);
         let MergeParams { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } =
             self.merge;
+        let RefineParams { refine_steps, refine_steps_per_prune: steps_per_prune, refine_keyframes, .. } = self.refine;
         let mut checks = vec![
             ("scan.alpha_min", self.scan.alpha_min, in_unit(self.scan.alpha_min), "0 to 1"),
             ("scan.outside", self.scan.outside, in_unit(self.scan.outside), "0 to 1"),
@@ -153,25 +154,15 @@ impl Recipe {
                 (0.01..=MAX_ROUND_FRACTION).contains(&self.select.round_fraction) || self.select.round_fraction == 1.0,
                 "0.01 to 0.99, or 1 for no rounds",
             ),
-            ("select.round_pictures", self.select.round_pictures as f64, self.select.round_pictures > 0, "1 or more"),
+            ("select.round_views", self.select.round_views as f64, self.select.round_views > 0, "1 or more"),
             (
-                "select.round_turns",
-                self.select.round_turns as f64,
-                (1..=1000).contains(&self.select.round_turns),
+                "select.round_groups",
+                self.select.round_groups as f64,
+                (1..=1000).contains(&self.select.round_groups),
                 "1 to 1000",
             ),
-            (
-                "refine.refine_steps",
-                f64::from(self.refine.refine_steps),
-                self.refine.refine_steps <= MOST_STEPS,
-                "0 to 1000000",
-            ),
-            (
-                "refine.refine_cut_steps",
-                f64::from(self.refine.refine_cut_steps),
-                self.refine.refine_cut_steps <= MOST_STEPS,
-                "0 to 1000000",
-            ),
+            ("refine.refine_steps", refine_steps.into(), refine_steps <= MOST_STEPS, "0 to 1000000"),
+            ("refine.refine_steps_per_prune", steps_per_prune.into(), steps_per_prune <= MOST_STEPS, "0 to 1000000"),
             (
                 "merge.passes",
                 self.merge.passes.len() as f64,
@@ -179,12 +170,12 @@ impl Recipe {
                 "at most 16 passes",
             ),
             (
-                "refine.refine_pictures",
-                self.refine.refine_pictures as f64,
-                (16..=1_000_000).contains(&self.refine.refine_pictures),
+                "refine.refine_target_views",
+                self.refine.refine_target_views as f64,
+                (16..=1_000_000).contains(&self.refine.refine_target_views),
                 "16 to 1000000",
             ),
-            ("refine.refine_knots", self.refine.refine_knots as f64, self.refine.refine_knots <= 1000, "0 to 1000"),
+            ("refine.refine_keyframes", refine_keyframes as f64, refine_keyframes <= 1000, "0 to 1000"),
             ("refine.refine_ssim", self.refine.refine_ssim, in_unit(self.refine.refine_ssim), "0 to 1"),
             ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),
             ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),
@@ -295,7 +286,7 @@ mod tests {
         for (text, parts) in [
             ("[select]\nround_fraction = 0.9999999999\n", ["select.round_fraction", "0.01 to 0.99, or 1"]),
             ("[refine]\nrefine_steps = 4000000000\n", ["refine.refine_steps", "0 to 1000000"]),
-            ("[refine]\nrefine_cut_steps = 4000000000\n", ["refine.refine_cut_steps", "0 to 1000000"]),
+            ("[refine]\nrefine_steps_per_prune = 4000000000\n", ["refine.refine_steps_per_prune", "0 to 1000000"]),
             (&many, ["merge.passes", "at most 16 passes, found 17"]),
         ] {
             let message = Recipe::from_toml(text, "default").unwrap_err();

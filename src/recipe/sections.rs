@@ -21,7 +21,7 @@ pub struct ScanParams {
     pub pixel_stride: NonZeroU32,
     pub view_stride: NonZeroU32,
     pub frame_stride: NonZeroU32,
-    pub look_pictures: usize,
+    pub scoring_views: usize,
     pub non_finite: NonFinite,
 }
 
@@ -130,8 +130,8 @@ pub struct SelectParams {
     pub tau_dynamic: f64,
     pub low_priority: LowScorePolicy,
     pub round_fraction: f64,
-    pub round_pictures: usize,
-    pub round_turns: usize,
+    pub round_views: usize,
+    pub round_groups: usize,
     pub contrast_floor: f64,
     pub choose_by_views: bool,
 }
@@ -173,10 +173,10 @@ pub struct MergeParams {
 pub struct RefineParams {
     pub refine: AttributeGroups,
     pub refine_steps: u32,
-    pub refine_cut_steps: u32,
-    pub refine_pictures: usize,
+    pub refine_steps_per_prune: u32,
+    pub refine_target_views: usize,
     pub refine_ssim: f64,
-    pub refine_knots: usize,
+    pub refine_keyframes: usize,
 }
 
 /// Parameters of the precision with which the deformation field is written.

@@ -81,18 +81,18 @@ pub struct RefineStage {
     pub steps: usize,
     /// Number of optimization steps before each prune step, reduced by [`RefineStage::steps_before`] while many
     /// Gaussians are left.
-    pub cut_steps: usize,
+    pub steps_per_prune: usize,
     /// Maximum number of target views (renders of the original that the Gaussians are fitted to).
     pub pictures: usize,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
-    pub cuts: bool,
+    pub prunes: bool,
     /// Color difference (norm over red, green, blue, each from 0 to 1) whose square is added to the squared color
     /// difference between a Gaussian and the colors that it hides, when Gaussians are ranked for a prune step; see
     /// [`crate::render::RemovalError`].
     pub contrast_floor: f64,
     /// Maximum number of keyframes of the time-varying delta (values that refinement adds to each frame, interpolated
     /// between keyframes), for inputs with explicit frames. With 0, all added values are constant in time.
-    pub knots: usize,
+    pub keyframes: usize,
     /// Fraction of the Gaussians that the user wants to keep; `None` if not given.
     pub target: Option<f64>,
 }
@@ -101,21 +101,27 @@ impl RefineStage {
     /// Returns the refinement stage with the parameters of `recipe`, or `None` if `recipe` optimizes no attribute or
     /// has no optimization steps.
     /// - `target`: fraction of the Gaussians that the user wants to keep; `None` if not given.
-    /// - `cuts`: whether refinement may remove Gaussians in prune steps between optimization steps. Prune steps need a
+    /// - `prunes`: whether refinement may remove Gaussians in prune steps between optimization steps. Prune steps need a
     ///   run that ranks Gaussians by renders.
-    pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
-        let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
-            recipe.refine;
+    pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, prunes: bool) -> Option<RefineStage> {
+        let recipe::RefineParams {
+            refine,
+            refine_steps,
+            refine_steps_per_prune,
+            refine_target_views,
+            refine_ssim,
+            refine_keyframes,
+        } = recipe.refine;
         let refine = RefineStage {
             columns: refine.0,
             sh_degree: NO_SH_LIMIT,
             loss: Loss { ssim: refine_ssim },
             steps: refine_steps as usize,
-            cut_steps: refine_cut_steps as usize,
-            pictures: refine_pictures,
-            cuts,
+            steps_per_prune: refine_steps_per_prune as usize,
+            pictures: refine_target_views,
+            prunes,
             contrast_floor: recipe.select.contrast_floor,
-            knots: refine_knots,
+            keyframes: refine_keyframes,
             target,
         };
         (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
@@ -129,25 +135,25 @@ impl RefineStage {
     /// Returns a copy of this stage whose parameter deltas (values that refinement adds to the stored parameters) do
     /// not vary with time.
     pub fn with_time_independent_deltas(self) -> RefineStage {
-        RefineStage { knots: 0, ..self }
+        RefineStage { keyframes: 0, ..self }
     }
 
     /// Returns a copy of this stage that removes no Gaussians.
     pub fn without_prune_steps(self) -> RefineStage {
-        RefineStage { cuts: false, ..self }
+        RefineStage { prunes: false, ..self }
     }
 
     /// Returns a copy of this stage with the numbers of optimization steps multiplied by `part` and rounded up, and
     /// with parameter deltas (values that refinement adds to the stored parameters) that do not vary with time.
     pub fn with_step_fraction(&self, part: f64) -> RefineStage {
         let scaled = |steps: usize| (part * steps as f64).ceil() as usize;
-        RefineStage { steps: scaled(self.steps), cut_steps: scaled(self.cut_steps), ..self.clone() }
+        RefineStage { steps: scaled(self.steps), steps_per_prune: scaled(self.steps_per_prune), ..self.clone() }
             .with_time_independent_deltas()
     }
 
     /// Returns the cache key of the parameters of this stage. It does not depend on the input.
     pub(crate) fn key(&self) -> CacheKey {
-        let step_settings = (self.steps, self.cut_steps, self.pictures, self.cuts, self.knots);
+        let step_settings = (self.steps, self.steps_per_prune, self.pictures, self.prunes, self.keyframes);
         CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, step_settings))
     }
 
@@ -160,7 +166,7 @@ impl RefineStage {
     /// ([`RefineStage::stride`]). This number is `first`, with which refinement begins; or a third of it if prune steps
     /// remove Gaussians, because fewer Gaussians allow a larger stride.
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
-        let fewer = if self.cuts { first / 3 } else { first };
+        let fewer = if self.prunes { first / 3 } else { first };
         self.stride(pixels, fewer)
     }
 
@@ -182,23 +188,24 @@ impl RefineStage {
     fn keyframes_for(&self, work: &Workload) -> usize {
         match (work.input.jacobian, work.frames) {
             // The number of frames of a stream is not known in advance, so the maximum number of keyframes is assumed.
-            (0, 0) => self.knots,
-            (0, frames) => keyframe_count(self.knots, frames as usize),
+            (0, 0) => self.keyframes,
+            (0, frames) => keyframe_count(self.keyframes, frames as usize),
             _ => 0,
         }
     }
 
-    /// Returns the number of optimization steps before a prune step: [`RefineStage::cut_steps`] · √(`wanted`/`left`).
-    /// `left`: number of Gaussians now. `wanted`: number of Gaussians after the last prune step. With more Gaussians
-    /// there are fewer steps, because a step takes longer and more of its effect is removed later.
+    /// Returns the number of optimization steps before a prune step:
+    /// [`RefineStage::steps_per_prune`] · √(`wanted`/`left`). `left`: number of Gaussians now. `wanted`: number of
+    /// Gaussians after the last prune step. With more Gaussians there are fewer steps, because a step takes longer and
+    /// more of its effect is removed later.
     fn steps_before(&self, left: usize, wanted: usize) -> usize {
-        (self.cut_steps as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
+        (self.steps_per_prune as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
     }
 
     /// Returns the minimum fraction of all Gaussians with which refinement begins, before its prune steps remove the
     /// surplus; `None` if there are no prune steps.
     pub fn start_fraction(&self) -> Option<f64> {
-        self.cuts.then_some(MIN_START_FRACTION)
+        self.prunes.then_some(MIN_START_FRACTION)
     }
 
     /// Returns the number of Gaussians with which refinement begins, given that it ends with `wanted` of the `all`
@@ -317,10 +324,10 @@ fn along_time(steps: usize) -> usize {
 /// `first` to `last` Gaussians.
 fn prune_counts(first: usize, last: usize) -> Vec<usize> {
     let ratio = last.max(1) as f64 / first.max(1) as f64;
-    let cuts = (ratio.ln() / MIN_PRUNE_FRACTION.ln() - 1e-9).ceil().max(0.0) as usize;
-    let after = |k: usize| (first as f64 * ratio.powf(k as f64 / cuts as f64)).round() as usize;
-    let mut prune_counts: Vec<usize> = std::iter::once(first).chain((1..cuts).map(after)).collect();
-    prune_counts.extend((cuts > 0).then_some(last));
+    let step_count = (ratio.ln() / MIN_PRUNE_FRACTION.ln() - 1e-9).ceil().max(0.0) as usize;
+    let after = |k: usize| (first as f64 * ratio.powf(k as f64 / step_count as f64)).round() as usize;
+    let mut prune_counts: Vec<usize> = std::iter::once(first).chain((1..step_count).map(after)).collect();
+    prune_counts.extend((step_count > 0).then_some(last));
     prune_counts
 }
 

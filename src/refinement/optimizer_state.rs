@@ -204,7 +204,7 @@ impl<'a> OptimizerState<'a> {
 
     /// Returns the time-varying delta, the values that refinement adds to each frame: one set of values per keyframe.
     pub(super) fn trajectory_delta(&self) -> TrajectoryDelta {
-        TrajectoryDelta(self.keyframe_optimizers.iter().map(|knot| knot.delta().clone()).collect())
+        TrajectoryDelta(self.keyframe_optimizers.iter().map(|keyframe| keyframe.delta().clone()).collect())
     }
 
     /// Returns the two keyframes around the frame with index `k` in `self.frames`: number and interpolation weight of
@@ -293,7 +293,7 @@ impl<'a> OptimizerState<'a> {
             self.keyframe_optimizers
                 .iter_mut()
                 .zip(keyframe_optimizers)
-                .for_each(|(knot, checkpoint)| knot.resume(checkpoint));
+                .for_each(|(keyframe, checkpoint)| keyframe.resume(checkpoint));
         }
         Ok(())
     }
@@ -365,8 +365,8 @@ impl<'a> OptimizerState<'a> {
             Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),
         }
         if !self.keyframe_optimizers.is_empty() {
-            let deltas = self.keyframes_around(k).map(|(knot, weight)| {
-                let change = self.keyframe_optimizers[knot].delta();
+            let deltas = self.keyframes_around(k).map(|(keyframe, weight)| {
+                let change = self.keyframe_optimizers[keyframe].delta();
                 let mut change = now.present.as_ref().map_or_else(|| change.clone(), |present| change.pick(present));
                 change.scale(weight);
                 change
@@ -412,8 +412,8 @@ impl<'a> OptimizerState<'a> {
                 }
             }
         }
-        for (knot, weight) in self.keyframes_around(self.frame_index(k)) {
-            self.keyframe_optimizers[knot].step(&self.gradients, weight, schedule);
+        for (keyframe, weight) in self.keyframes_around(self.frame_index(k)) {
+            self.keyframe_optimizers[keyframe].step(&self.gradients, weight, schedule);
         }
         Ok(())
     }

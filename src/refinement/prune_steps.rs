@@ -42,7 +42,7 @@ impl<'a> PrunedModels<'a> {
         let mut model = before.cloned().unwrap_or(start);
         while model.len() > size {
             let next = next_size(model.len(), size);
-            model = self.refinement.cut_down(&model, next, size)?;
+            model = self.refinement.prune_to(&model, next, size)?;
             if next > size {
                 self.models.push(model.clone());
             }

@@ -299,7 +299,7 @@ impl<'a> RefineRun<'a> {
 
     /// Makes one prune step: runs optimization steps, then removes all but `size` Gaussians of `reduction`. Returns the
     /// pruned model. `wanted`: number of Gaussians that remain after the last prune step.
-    pub(crate) fn cut_down(
+    pub(crate) fn prune_to(
         &mut self,
         reduction: &CompressedModel,
         size: usize,
@@ -347,7 +347,7 @@ impl<'a> RefineRun<'a> {
     /// added values are constant in time, as for inputs without explicit frames.
     fn keyframe_count(&self) -> usize {
         match self.scene.input.has_explicit_frames() {
-            true => keyframe_count(self.refine.knots, self.scene.source().info().times.len()),
+            true => keyframe_count(self.refine.keyframes, self.scene.source().info().times.len()),
             false => 0,
         }
     }

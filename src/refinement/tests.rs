@@ -120,7 +120,7 @@ fn interrupted_runs_resume_to_the_same_result() {
             let reduction = CompressedModel::pruned(scored.ranking().best_ids(2 * count / 5), &recipe.merge);
             let few = RefineStage {
                 steps,
-                cut_steps: 40,
+                steps_per_prune: 40,
                 pictures,
                 ..RefineStage::from_recipe(&recipe, None, true).unwrap()
             };
@@ -204,7 +204,8 @@ fn leaving_out_absent_gaussians_changes_no_result() {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         let reduction = CompressedModel::pruned(scored.ranking().best_ids(600), &recipe.merge);
-        let few = RefineStage { steps: 100, cut_steps: 40, ..RefineStage::from_recipe(&recipe, None, true).unwrap() };
+        let few =
+            RefineStage { steps: 100, steps_per_prune: 40, ..RefineStage::from_recipe(&recipe, None, true).unwrap() };
         few.run(&scene, &scored, reduction, 250, &mut Journal::default()).unwrap()
     });
     assert!(!away.delta.is_empty() && away.delta == unseen.delta);
@@ -246,7 +247,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
             let reduction = CompressedModel::pruned(kept.clone(), &recipe.merge);
             let few = RefineStage {
                 steps: 300,
-                knots: keyframe_count,
+                keyframes: keyframe_count,
                 ..RefineStage::from_recipe(&recipe, None, false).unwrap()
             };
             few.run(&scene, &scored, reduction, kept.len(), &mut Journal::default()).unwrap()

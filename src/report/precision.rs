@@ -209,10 +209,10 @@ mod tests {
 
     fn knob(marks: Vec<PrecisionSetting>) -> PrecisionKnob {
         PrecisionKnob {
-            name: "look".to_owned(),
+            name: "scoring".to_owned(),
             about: "<b>".to_owned(),
             source: ErrorSource::Discretization,
-            curves: vec![PrecisionCurve::new("look_pictures", "all", marks, Some(2.0), &[])],
+            curves: vec![PrecisionCurve::new("scoring_views", "all", marks, Some(2.0), &[])],
         }
     }
 
@@ -225,10 +225,10 @@ mod tests {
         assert_eq!(
             titles,
             [
-                "look: error added / error of the model, by time of all processors",
-                "look: relative L2 error of C, by time of all processors",
-                "look: error added / error of the model, by wall time",
-                "look: error added / error of the model, by peak memory",
+                "scoring: error added / error of the model, by time of all processors",
+                "scoring: relative L2 error of C, by time of all processors",
+                "scoring: error added / error of the model, by wall time",
+                "scoring: error added / error of the model, by peak memory",
             ]
         );
         for (title, svg) in &charts {

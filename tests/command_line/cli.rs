@@ -521,7 +521,7 @@ fn stages_print_once_and_undone_merging_is_left_out() {
         assert!(told.len() > 5 && told.is_sorted_by(|a, b| a < b), "{}", run.stderr);
         run.stderr.lines().any(|line| line.starts_with("merging  left out: PSNR on scored views at the same "))
     };
-    let undone =
-        ["0.2 --no-refine", "0.8 --no-refine", "0.4 --set refine_steps=20 --set refine_cut_steps=5"].map(compress);
+    let undone = ["0.2 --no-refine", "0.8 --no-refine", "0.4 --set refine_steps=20 --set refine_steps_per_prune=5"]
+        .map(compress);
     assert_eq!(undone, [false, true, false]);
 }

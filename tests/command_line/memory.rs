@@ -109,11 +109,11 @@ fn peak_memory(result: &Path) -> Option<(u64, String)> {
 fn named_minimum_memory_works_and_changes_no_byte() {
     let workplace = scene_workplace();
     for (input, rest) in [
-        ("packed.gseq", "--ratio 0.4 --set refine_steps=30 --set refine_cut_steps=5 --as archive"),
+        ("packed.gseq", "--ratio 0.4 --set refine_steps=30 --set refine_steps_per_prune=5 --as archive"),
         ("packed.gseq", "--no-refine"),
         ("raw.gseq", "--no-refine"),
         ("packed.gseq", "--ratio 0.4 --no-refine"),
-        ("packed.gseq", "--ratio 0.3 --set refine_steps=30 --set refine_cut_steps=5"),
+        ("packed.gseq", "--ratio 0.3 --set refine_steps=30 --set refine_steps_per_prune=5"),
         ("packed.gseq", "--preset paper"),
     ] {
         let request = |output: &str| format!("compress {input} {REQUEST} {rest} -o {output}/small.gseq --overwrite");

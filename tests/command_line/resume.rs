@@ -177,10 +177,10 @@ fn changed_recipe_recomputes_only_dependent_stages() {
     assert_eq!(no_steps(run("steps", "--set refine_steps=160")), ["refine"]);
     // Frames and target views are not read again. Ranking by fewer views is computed again; later stages only if the
     // ranking differs.
-    let look = run("look", "--set look_pictures=12");
-    let is_new = |stage: &str| look.iter().any(|name| name == stage);
-    assert!(is_new("visible") && is_new("score") && is_new("rounds"), "{look:?}");
-    assert!(!is_new("scan") && !is_new("input") && !is_new("targets"), "{look:?}");
+    let fewer = run("fewer", "--set scoring_views=12");
+    let is_new = |stage: &str| fewer.iter().any(|name| name == stage);
+    assert!(is_new("visible") && is_new("score") && is_new("rounds"), "{fewer:?}");
+    assert!(!is_new("scan") && !is_new("input") && !is_new("targets"), "{fewer:?}");
     let threads = ["--threads 1", "--memory 600MiB"].map(|options| run("elsewhere", &format!("{options} --overwrite")));
     assert_eq!(threads, [[""; 0], [""; 0]], "threads and memory change no result");
 }

@@ -151,7 +151,7 @@ fn presets_read_no_more_than_planned_in_any_memory() {
             }
             let output = format!("{preset}{k}.gseq");
             let arguments = format!(
-                "demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} --set refine_steps=60 --set refine_cut_steps=10 -o {output}"
+                "demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} --set refine_steps=60 --set refine_steps_per_prune=10 -o {output}"
             );
             let read = reads_as_planned(&workplace, &arguments);
             // An input that fits into memory is read once; two threads may start to read the same tile at the same

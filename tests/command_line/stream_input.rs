@@ -44,11 +44,11 @@ fn stream_and_packed_file_give_the_same_bytes() {
     let (as_it_arrives, at_the_end): (&[&str], &[&str]) = (&["receive", "score"], &["receive", "visible", "score"]);
     for (name, rest, first) in [
         ("default", "--cameras {tiny}", at_the_end),
-        ("all", "--cameras {tiny} --set look_pictures=0", as_it_arrives),
+        ("all", "--cameras {tiny} --set scoring_views=0", as_it_arrives),
         ("paper", "--cameras {tiny} --preset paper", as_it_arrives),
         (
             "merged",
-            "--cameras {tiny} --ratio 0.3 --set frame_stride=3 --set view_stride=2 --set look_pictures=0",
+            "--cameras {tiny} --ratio 0.3 --set frame_stride=3 --set view_stride=2 --set scoring_views=0",
             as_it_arrives,
         ),
         ("rig", "", as_it_arrives),

@@ -296,7 +296,7 @@ fn asked_quality_includes_the_loss_of_the_archive() {
     let workplace = Workplace::new();
     let least = 30.0;
     let summary = workplace.summary(&format!(
-        "{{tiny}} --cameras {{tiny}} --min-psnr {least}dB --set refine_steps=40 --set refine_cut_steps=10 -o small.gsz"
+        "{{tiny}} --cameras {{tiny}} --min-psnr {least}dB --set refine_steps=40 --set refine_steps_per_prune=10 -o small.gsz"
     ));
     let number = |name: &str| summary["goal"][name].as_f64().unwrap();
     assert_eq!(number("asked"), least);

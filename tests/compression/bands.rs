@@ -116,7 +116,7 @@ fn sh_coefficients_stay_with_an_sh_head_or_at_degree_0() {
 fn lower_sh_degree_bytes_ignore_thread_count() {
     let workplace = Workplace::new();
     write_faint_above(&workplace, 1);
-    let how = "--ratio 0.3 --set refine_steps=40 --set refine_cut_steps=10";
+    let how = "--ratio 0.3 --set refine_steps=40 --set refine_steps_per_prune=10";
     for threads in [1, 3] {
         workplace.done(&format!("compress model --cameras {{tiny}} {how} --threads {threads} -o small{threads}"));
     }
@@ -191,7 +191,7 @@ fn lower_degree_passes_the_loader_check_and_a_wrong_one_fails() {
 fn asked_degree_is_refined_to_its_best() {
     let workplace = Workplace::new();
     let model = write_faint_above(&workplace, 3);
-    let how = "--ratio 0.3 --set refine_steps=100 --set refine_cut_steps=20 --set field=exact";
+    let how = "--ratio 0.3 --set refine_steps=100 --set refine_steps_per_prune=20 --set field=exact";
     let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} --set bands=0 -o small"));
     assert!(
         summary["notes"]
@@ -261,7 +261,8 @@ fn impossible_degree_is_refused_by_name() {
 fn target_size_picks_the_best_sh_degree() {
     let workplace = Workplace::new();
     write_faint_above(&workplace, 0);
-    let how = "model --cameras {tiny} --size 85kB --set field=exact --set refine_steps=100 --set refine_cut_steps=20";
+    let how =
+        "model --cameras {tiny} --size 85kB --set field=exact --set refine_steps=100 --set refine_steps_per_prune=20";
     let chosen = workplace.summary(&format!("{how} -o chosen"));
     let all = workplace.summary(&format!("{how} --set bands=all -o all"));
     let names = |result: &str| PlyRows::read(&point_cloud(&workplace.path(result))).names.len();

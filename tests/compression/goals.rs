@@ -14,7 +14,8 @@ fn with_demo() -> Workplace {
 }
 
 /// Arguments for the generated scene and a short refinement.
-const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
+const QUICKLY: &str =
+    "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_steps_per_prune=20";
 
 /// Returns the total number of bytes of all files below the output folder, or of the output file and the files beside
 /// it that begin with its name.
@@ -84,7 +85,7 @@ fn max_loss_compares_with_photographs() {
 #[ignore = "needs time"]
 fn output_size_is_just_below_the_target() {
     let workplace = with_demo();
-    let model = "{tiny} --cameras {tiny} --set refine_steps=40 --set refine_cut_steps=10";
+    let model = "{tiny} --cameras {tiny} --set refine_steps=40 --set refine_steps_per_prune=10";
     for (how, output, most) in
         [(QUICKLY, "small.gseq", 90_000u64), (QUICKLY, "frames", 400_000), (model, "model", 110_000)]
     {

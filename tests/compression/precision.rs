@@ -54,7 +54,7 @@ fn exact_settings_have_no_error_and_others_converge() {
     let cameras = read(&fs::read_to_string(place.path("d/cameras.json")).unwrap());
     fs::write(place.path("d/cameras.json"), held_out(&cameras).to_string()).unwrap();
     let run = place.run(
-        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs look,rounds,percentiles,sums --repeat 1 --json",
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs scoring,rounds,percentiles,sums --repeat 1 --json",
     );
     assert_eq!(run.code, 0, "{}", run.stderr);
     let found = read(&run.stdout);
@@ -63,14 +63,14 @@ fn exact_settings_have_no_error_and_others_converge() {
     // 5 frames of 6 cameras, of which one is a test camera.
     assert_eq!((&found["pictures"], &found["judged"]), (&25.into(), &5.into()));
 
-    for curve in curves(&found, "look") {
+    for curve in curves(&found, "scoring") {
         for kind in ["C", "W", "kept", "staying", "added"] {
             assert_eq!(errors(curve, kind).last(), Some(&0.0), "{kind} of {}", curve["name"]);
         }
         let of_c = errors(curve, "C");
         assert!(of_c[0] > 0.0, "{}: nothing is sampled", curve["name"]);
         assert_ne!(of_c[0], of_c[of_c.len() - 2], "{}: nothing is turned", curve["name"]);
-        assert!(curve["name"] != "look_pictures" || errors(curve, "staying")[0] > 0.0, "as many stay");
+        assert!(curve["name"] != "scoring_views" || errors(curve, "staying")[0] > 0.0, "as many stay");
         let costs = curve["marks"].as_array().unwrap().iter().map(|mark| &mark["cost"]);
         for cost in costs {
             let seconds = ["least", "median", "most"].map(|name| cost["seconds"][name].as_f64().unwrap());
@@ -89,7 +89,7 @@ fn exact_settings_have_no_error_and_others_converge() {
 
     let percentiles = &curves(&found, "percentiles")[0];
     // All views are used if there are so few: exact percentiles give what the finest view sampling gives.
-    let [exact, finest] = [percentiles, &curves(&found, "look")[0]]
+    let [exact, finest] = [percentiles, &curves(&found, "scoring")[0]]
         .map(|curve| &curve["marks"].as_array().unwrap().last().unwrap()["psnr"]);
     assert!(exact.is_number() && exact == finest, "{exact} {finest}");
     let values = errors(percentiles, "percentiles");
@@ -109,7 +109,7 @@ fn exact_settings_have_no_error_and_others_converge() {
     }
 
     let page = fs::read_to_string(place.path("diagrams/precision.html")).unwrap();
-    for words in ["look: error added", "order of percentiles", "relative L2 error of kappa", "peak memory"] {
+    for words in ["scoring: error added", "order of percentiles", "relative L2 error of kappa", "peak memory"] {
         assert!(page.contains(words), "{words} is missing");
     }
     let csv = fs::read_to_string(place.path("diagrams/precision.csv")).unwrap();
@@ -180,13 +180,13 @@ fn unused_settings_of_a_recipe_are_left_out_by_name() {
     let place = Workplace::new();
     place.done("test-scene -o d --gaussians 300 --frames 3");
     let found = read(&place.done(
-        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --preset paper --knobs look,rounds,percentiles,refining \
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --preset paper --knobs scoring,rounds,percentiles,refining \
          --repeat 1 --json",
     ));
     let names: Vec<&Value> = found["knobs"].as_array().unwrap().iter().map(|knob| &knob["name"]).collect();
     assert_eq!(names, ["percentiles"]);
     let notes = found["notes"].to_string();
-    for words in ["look: not run", "rounds: not run", "refining: not run"] {
+    for words in ["scoring: not run", "rounds: not run", "refining: not run"] {
         assert!(notes.contains(words), "{notes}");
     }
 }

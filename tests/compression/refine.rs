@@ -144,7 +144,7 @@ fn refinement_changes_only_named_unprotected_values() {
     ] {
         workplace.done(&format!(
             "compress {{tiny}} --cameras {{tiny}} --ratio 0.3 --set refine={groups} --keep-ids 3,200-209 \
-             --set refine_steps=200 --set refine_cut_steps=20 --overwrite -o out"
+             --set refine_steps=200 --set refine_steps_per_prune=20 --overwrite -o out"
         ));
         let after = cloud(&workplace.path("out"));
         let map = index_map(&workplace.path("out/index_map.npy"));

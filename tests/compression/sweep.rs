@@ -96,8 +96,9 @@ fn refinement_step_points_equal_compress() {
     let settings = knob["settings"].as_array().unwrap();
     assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
     // Before each prune step there are 2/15 of the steps, as in the preset: 25 · 2/15, rounded up.
-    workplace
-        .done("compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_cut_steps=4");
+    workplace.done(
+        "compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_steps_per_prune=4",
+    );
     let evaluated = json(&workplace.done("evaluate {tiny} small --cameras {tiny} --max-frames 2 --json"));
     let unrefined = swept["points"].as_array().unwrap().iter().find(|point| point["asked"] == 0.3).unwrap();
     for name in ["psnr", "ssim"] {

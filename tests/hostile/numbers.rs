@@ -10,7 +10,7 @@ use crate::runner::{Attack, Folder, Outcome};
 
 /// Options that make a run with a few Gaussians short.
 const QUICK: &str =
-    "--cameras cameras.json --set refine_pictures=26 --set refine_steps=12 --set refine_cut_steps=3 --quiet";
+    "--cameras cameras.json --set refine_target_views=26 --set refine_steps=12 --set refine_steps_per_prune=3 --quiet";
 
 /// Returns Gaussians of medium size and SH degree 1, distributed over a cube of side 2 by the golden ratio.
 fn cloud(count: usize) -> Gaussians {
@@ -301,10 +301,10 @@ fn slow_extreme_parameters_end() {
         "--set max_neighbors=1024 --no-refine",
         "--set round_fraction=0.99 --count 1",
         "--set round_fraction=0.1 --count 1",
-        "--set refine_knots=1000",
-        "--set round_turns=1000",
-        "--set round_pictures=1000000000",
-        "--set look_pictures=1000000000",
+        "--set refine_keyframes=1000",
+        "--set round_groups=1000",
+        "--set round_views=1000000000",
+        "--set scoring_views=1000000000",
         "--set pixel_stride=4294967295",
         "--set frame_stride=4294967295",
         "--set alpha_min=1",

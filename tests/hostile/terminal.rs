@@ -397,7 +397,7 @@ fn slow_outputs_of_all_commands_contain_no_folder_names() {
         "compress {m} --cameras {m} --no-refine --max-loss 9dB --ground-truth {o}/photos -o {o}/goal",
         "evaluate {m} {o}/small --cameras {m} --csv {o}/scores.csv",
         "sweep {m} --cameras {m} -o {o}/curves --fractions 0.5 --methods default,random --max-frames 1 --steps 2 --steps-at 0.5",
-        "precision {m} --cameras {m} -o {o}/diagrams --knobs look --max-frames 1 --repeat 1",
+        "precision {m} --cameras {m} -o {o}/diagrams --knobs scoring --max-frames 1 --repeat 1",
         "report {m} {o}/small --cameras {m} --ground-truth {o}/photos --sweep {o}/curves/sweep.json \
          --precision {o}/diagrams/precision.json -o {o}/report",
         "view {m} {o}/small --cameras {m} -o {o}/scene.html",

@@ -135,6 +135,7 @@ impl FeaturePlane {
 
     /// Returns the channels of the texel (grid point) with index `a` along the first axis of the plane and `b` along
     /// the second. `channels` is the number of channels of the plane.
+    #[inline(always)]
     pub(super) fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
         let start = (b as usize * self.size_a + a as usize) * channels;
         &self.texels[start..start + channels]
@@ -142,6 +143,7 @@ impl FeaturePlane {
 
     /// Interpolates the plane bilinearly at one point and writes one value per channel to `out`. `a` and `b` give the
     /// neighboring texels (grid points) and their weights along the first and the second axis.
+    #[inline(always)]
     fn sample(&self, a: TexelPair, b: TexelPair, out: &mut [f32]) {
         let channels = out.len();
         let corner = |ia, ib| self.texel(ia, ib, channels);
@@ -162,6 +164,7 @@ impl FeaturePlane {
 /// Returns the two neighbors of the normalized coordinate `u` among `size` texels (grid points) along an axis, and the
 /// weight of the second one. The first texel lies at −1 and the last at 1 (`align_corners`). Coordinates beyond them
 /// are clamped. A NaN coordinate gives a NaN fraction, hence NaN features.
+#[inline(always)]
 pub fn texel_pair(u: f32, size: usize) -> TexelPair {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
@@ -238,6 +241,26 @@ impl Planes {
     /// Computes the part of the features that does not depend on time, for Gaussians at the stored positions `position`
     /// (`[3, N]`).
     pub(super) fn prepare(&self, position: &AttributeValues) -> PreparedPlanes {
+        #[cfg(target_arch = "x86_64")]
+        {
+            /// Calls [`Planes::prepare_rows`], compiled for AVX2. Multiply-adds are not fused, so results have
+            /// the same bits as without AVX2.
+            #[target_feature(enable = "avx2")]
+            fn prepare_avx2(planes: &Planes, position: &AttributeValues) -> PreparedPlanes {
+                planes.prepare_rows(position)
+            }
+            if is_x86_feature_detected!("avx2") {
+                // SAFETY: AVX2 was detected on the line above.
+                return unsafe { prepare_avx2(self, position) };
+            }
+        }
+        self.prepare_rows(position)
+    }
+
+    /// Computes the result of [`Planes::prepare`]. The compiler inlines this function into one copy per instruction
+    /// set.
+    #[inline(always)]
+    fn prepare_rows(&self, position: &AttributeValues) -> PreparedPlanes {
         let rows = position.len();
         let width = self.width();
         let mut prepared = PreparedPlanes {

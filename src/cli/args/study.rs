@@ -57,7 +57,7 @@ pub(in crate::cli) struct PrecisionArgs {
     pub(in crate::cli) input: Input,
     #[command(flatten)]
     pub(in crate::cli) cameras: CameraFile,
-    /// Settings to vary: views and strides of the first scoring pass (`look`); views and steps of pruning `rounds`;
+    /// Settings to vary: views and strides of the first scoring pass (`scoring`); views and steps of pruning `rounds`;
     /// bits of `percentiles`; f32 and f64 `sums`; radius and passes of `merging`; steps and views of `refining`;
     /// threads and memory of the `machine` [default: all; long inputs without the last three, which take whole runs]
     #[arg(long, value_name = "KNOBS", value_delimiter = ',',

@@ -13,7 +13,7 @@ use crate::scene::view_selection::{ViewSet, select_views};
 use crate::source::Ids;
 
 /// Maximum number of views on which quality is measured.
-const PICTURES: usize = 24;
+const MAX_VIEWS: usize = 24;
 
 /// Renders of the whole model, with which renders of a selection of its Gaussians are compared.
 ///
@@ -33,15 +33,15 @@ pub(super) struct JudgedQuality {
 }
 
 impl Judge {
-    /// Renders the held-out (test) views of `scene`, or all views if none are held out. Of more than [`PICTURES`]
-    /// views, renders an evenly spaced selection of [`PICTURES`]. Returns these renders as the reference for
+    /// Renders the held-out (test) views of `scene`, or all views if none are held out. Of more than [`MAX_VIEWS`]
+    /// views, renders an evenly spaced selection of [`MAX_VIEWS`]. Returns these renders as the reference for
     /// [`Judge::quality`].
     ///
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.
     pub(super) fn new(scene: &Scene) -> Result<Judge> {
         let all = select_views(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?;
-        let count = all.len().min(PICTURES);
+        let count = all.len().min(MAX_VIEWS);
         let pictures: Vec<FrameView> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
         let mut originals = Vec::with_capacity(count);
         render_views(scene, RenderedSource::all_gaussians(scene.source()), &pictures, |image| originals.push(image))?;
@@ -50,7 +50,7 @@ impl Judge {
 
     /// Returns the bytes of memory that the renders of a [`Judge`] take if each view has `pixels` pixels.
     pub(super) fn bytes(pixels: u64) -> u64 {
-        12 * pixels * PICTURES as u64
+        12 * pixels * MAX_VIEWS as u64
     }
 
     /// Returns the number of views on which quality is measured.

@@ -77,7 +77,7 @@ impl Knob {
     /// Returns the name of this knob on the command line and in the results.
     pub fn name(self) -> &'static str {
         match self {
-            Knob::FirstRanking => "look",
+            Knob::FirstRanking => "scoring",
             Knob::Rounds => "rounds",
             Knob::Percentiles => "percentiles",
             Knob::Sums => "sums",

@@ -24,7 +24,7 @@ use crate::statistics::score::{PercentilePasses, ScoredQuantity, Scores, score_w
 
 /// Numbers of views that are tried for the first ranking and for a pruning round. Numbers that exceed the number of
 /// views of the scene are skipped.
-const PICTURES_TRIED: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
+const VIEW_COUNTS: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
 /// Maximum number of views per pruning round that is tried.
 const MOST_IN_ROUNDS: usize = 400;
 /// Strides of pixels, views and frames that are tried. With a stride of n, every n-th is used.
@@ -68,18 +68,18 @@ impl Bench<'_> {
             let mut recipe = self.recipe.clone();
             let one = NonZeroU32::MIN;
             let scan = &mut recipe.scan;
-            (scan.look_pictures, scan.pixel_stride, scan.view_stride, scan.frame_stride) = (0, one, one, one);
+            (scan.scoring_views, scan.pixel_stride, scan.view_stride, scan.frame_stride) = (0, one, one, one);
             change(scan);
             RankingVariant { value, step, recipe }
         };
         let (finest, cost) = self.contributions_with_cost(&variant(1.0, 1.0, &|_| ()).recipe)?;
         let Some(finest) = finest else { return Ok(None) };
-        let own = Some(self.recipe.scan.look_pictures).filter(|&own| own > 0 && own < all).unwrap_or(all);
-        let counts = tried(PICTURES_TRIED.into_iter().chain([own]).filter(|&count| count < all));
+        let own = Some(self.recipe.scan.scoring_views).filter(|&own| own > 0 && own < all).unwrap_or(all);
+        let counts = tried(VIEW_COUNTS.into_iter().chain([own]).filter(|&count| count < all));
         let counts =
-            counts.into_iter().map(|n| variant(n as f64, 1.0 / n as f64, &|scan| scan.look_pictures = n)).collect();
+            counts.into_iter().map(|n| variant(n as f64, 1.0 / n as f64, &|scan| scan.scoring_views = n)).collect();
         let last = (all as f64, 1.0 / all.max(1) as f64);
-        let mut curves = vec![self.pass_curve("look_pictures", counts, (last, &finest, &cost), Some(own as f64))?];
+        let mut curves = vec![self.pass_curve("scoring_views", counts, (last, &finest, &cost), Some(own as f64))?];
         let frames_with_views = self.scene.schedule.iter().filter(|views| !views.is_empty()).count();
         let views = self.scene.schedule.max_views_per_frame();
         type SetStride = fn(&mut recipe::ScanParams, NonZeroU32);
@@ -96,7 +96,7 @@ impl Bench<'_> {
             curves.push(self.pass_curve(name, variants, ((1.0, 1.0), &finest, &cost), None)?);
         }
         Ok(Some(PrecisionKnob {
-            name: "look".to_owned(),
+            name: "scoring".to_owned(),
             about:
                 "The first pass over the views: contributions C and W of every Gaussian from some of the views, and \
                     which Gaussians the scores based on these keep, before any pruning round."
@@ -173,11 +173,11 @@ impl Bench<'_> {
         let scored = self.scored(Some(contributions))?;
         let own = &self.recipe.select;
         let most = self.scene.schedule.pair_count().min(MOST_IN_ROUNDS);
-        let own_pictures = own.round_pictures.min(most);
-        let mut by_pictures = Vec::new();
-        for count in tried(PICTURES_TRIED.into_iter().filter(|&count| count < most).chain([own_pictures, most])) {
-            let select = recipe::SelectParams { round_pictures: count, ..own.clone() };
-            by_pictures.push(self.rank_by(&scored, &select, count as f64, 1.0 / count as f64)?);
+        let own_views = own.round_views.min(most);
+        let mut by_views = Vec::new();
+        for count in tried(VIEW_COUNTS.into_iter().filter(|&count| count < most).chain([own_views, most])) {
+            let select = recipe::SelectParams { round_views: count, ..own.clone() };
+            by_views.push(self.rank_by(&scored, &select, count as f64, 1.0 / count as f64)?);
         }
         let mut fractions: Vec<f64> = FRACTIONS.into_iter().chain([own.round_fraction]).filter(|&f| f < 1.0).collect();
         fractions.sort_unstable_by(f64::total_cmp);
@@ -187,9 +187,9 @@ impl Bench<'_> {
             let select = recipe::SelectParams { round_fraction: fraction, ..own.clone() };
             by_fraction.push(self.rank_by(&scored, &select, fraction, -fraction.ln())?);
         }
-        let own = (Some(own_pictures as f64), Some(own.round_fraction));
+        let own = (Some(own_views as f64), Some(own.round_fraction));
         let curves = vec![
-            self.curve("round_pictures", "the largest number of views", by_pictures, own.0, &[])?,
+            self.curve("round_views", "the largest number of views", by_views, own.0, &[])?,
             self.curve("round_fraction", "the rounds that remove least", by_fraction, own.1, &[])?,
         ];
         Ok(Some(PrecisionKnob {

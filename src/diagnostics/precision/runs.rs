@@ -26,7 +26,7 @@ const PASSES: [usize; 3] = [1, 2, 3];
 /// Numbers of optimization steps of refinement that are tried.
 const STEPS: [u32; 6] = [100, 250, 500, 1000, 1500, 3000];
 /// Numbers of target views (views of the original that refinement fits) that are tried.
-const PICTURES_REFINED_BY: [usize; 5] = [32, 65, 130, 260, 520];
+const TARGET_VIEW_COUNTS: [usize; 5] = [32, 65, 130, 260, 520];
 /// Memory limits that are tried, as multiples of the smallest limit with which the program can run.
 const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
 
@@ -91,11 +91,11 @@ impl Bench<'_> {
             let recipe = self.recipe.with_refinement_steps(steps);
             by_steps.push(self.measure_quality(&recipe, f64::from(steps), 1.0 / f64::from(steps))?);
         }
-        let mut by_pictures = Vec::new();
-        for pictures in PICTURES_REFINED_BY {
+        let mut by_target_views = Vec::new();
+        for pictures in TARGET_VIEW_COUNTS {
             let mut recipe = self.recipe.clone();
-            recipe.refine.refine_pictures = pictures;
-            by_pictures.push(self.measure_quality(&recipe, pictures as f64, 1.0 / pictures as f64)?);
+            recipe.refine.refine_target_views = pictures;
+            by_target_views.push(self.measure_quality(&recipe, pictures as f64, 1.0 / pictures as f64)?);
         }
         Ok(Some(PrecisionKnob {
             name: "refining".to_owned(),
@@ -103,7 +103,13 @@ impl Bench<'_> {
             source: ErrorSource::Model,
             curves: vec![
                 PrecisionCurve::new("refine_steps", WHOLE, by_steps, Some(base.refine_steps.into()), &[]),
-                PrecisionCurve::new("refine_pictures", WHOLE, by_pictures, Some(base.refine_pictures as f64), &[]),
+                PrecisionCurve::new(
+                    "refine_target_views",
+                    WHOLE,
+                    by_target_views,
+                    Some(base.refine_target_views as f64),
+                    &[],
+                ),
             ],
         }))
     }

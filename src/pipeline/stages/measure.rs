@@ -150,8 +150,8 @@ impl Stage for MeasureStages {
 
     fn parameters(&self) -> String {
         match &self.visible {
-            Some(visible) if visible.recipe.look_pictures > 0 => {
-                format!("visible: {} views at most", visible.recipe.look_pictures)
+            Some(visible) if visible.recipe.scoring_views > 0 => {
+                format!("visible: {} views at most", visible.recipe.scoring_views)
             }
             Some(_) => "visible: every view".to_owned(),
             None => String::new(),
@@ -161,7 +161,7 @@ impl Stage for MeasureStages {
     fn shardable_units(&self, scene: &Scene, _: &CountPlan) -> Vec<String> {
         let mut units = vec![format!("{}: {} blocks of Gaussians", scan::NAME, scan_units(scene.source().info()))];
         if let Some(visible) = &self.visible {
-            let most = match visible.recipe.look_pictures {
+            let most = match visible.recipe.scoring_views {
                 0 => scene.schedule.pair_count(),
                 most => most.min(scene.schedule.pair_count()),
             };

@@ -27,8 +27,8 @@ impl Stage for RefineStage {
     }
 
     fn parameters(&self) -> String {
-        let RefineStage { steps, cut_steps, pictures, .. } = self;
-        format!("refine: {steps} steps at the end, {cut_steps} before a prune step, toward {pictures} views")
+        let RefineStage { steps, steps_per_prune, pictures, .. } = self;
+        format!("refine: {steps} steps at the end, {steps_per_prune} before a prune step, toward {pictures} views")
     }
 
     /// Returns whether refinement may be unnecessary: the run removes so few Gaussians that the PSNR of renders against

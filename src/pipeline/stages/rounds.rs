@@ -40,9 +40,9 @@ pub(crate) struct Rounds {
     pub fraction: f64,
     /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
     pub pictures: usize,
-    /// Number of groups (turns) into which the views are divided. Every round after the first renders the views of one
-    /// group; for the other groups it uses errors measured in earlier rounds.
-    pub turns: usize,
+    /// Number of groups into which the views are divided. Every round after the first renders the views of one group;
+    /// for the other groups it uses errors measured in earlier rounds.
+    pub groups: usize,
     /// Color difference (norm over red, green and blue, each from 0 to 1) whose square is added to the squared color
     /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
     /// color of its background.
@@ -76,8 +76,8 @@ impl Stage for Rounds {
     }
 
     fn parameters(&self) -> String {
-        let (percent, Rounds { pictures, turns, .. }) = (100.0 * self.fraction, self);
-        format!("rounds: each keeps {percent:.0}% of the Gaussians, ranked on {pictures} views in {turns} groups")
+        let (percent, Rounds { pictures, groups, .. }) = (100.0 * self.fraction, self);
+        format!("rounds: each keeps {percent:.0}% of the Gaussians, ranked on {pictures} views in {groups} groups")
     }
 
     fn shardable_units(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
@@ -104,13 +104,13 @@ impl Rounds {
     pub(crate) fn from_recipe(recipe: &recipe::SelectParams, target: Option<f64>) -> Option<Rounds> {
         let recipe::SelectParams {
             round_fraction: fraction,
-            round_pictures: pictures,
-            round_turns: turns,
+            round_views: pictures,
+            round_groups: groups,
             contrast_floor,
             ..
         } = *recipe;
         let (fewest, usual) = (target.unwrap_or(MIN_LEFT), target.unwrap_or(USUAL_LEFT));
-        (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
+        (fraction < 1.0).then_some(Rounds { fraction, pictures, groups, contrast_floor, fewest, usual })
     }
 
     /// Returns the resource estimate of the stage. Its memory holds the ranking, the measured removal errors, and the
@@ -118,20 +118,20 @@ impl Rounds {
     pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.view_pass_memory(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
-        let turns = (self.turns as u64).min(all).max(1);
+        let groups = (self.groups as u64).min(all).max(1);
         let per_gaussian =
-            [scored_memory(limits), vec![("ranking", 32), ("errors", 8 * turns), ("found", 8 * turns)], looking]
+            [scored_memory(limits), vec![("ranking", 32), ("errors", 8 * groups), ("found", 8 * groups)], looking]
                 .concat();
         let seconds = (0..self.rounds(self.usual)).map(|round| {
             let left = work.gaussian_count() * self.fraction.powi(round as i32);
-            let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
+            let pictures = all as f64 / if round == 0 { 1.0 } else { groups as f64 };
             work.reading_seconds(left, pictures.min(work.frames as f64))
                 + work.render_seconds(pictures, left, REMOVAL_COST)
         });
         // The first round renders the views of all groups one group after the other, every later round one group.
-        let frames = all.min(work.frames).div_ceil(turns);
+        let frames = all.min(work.frames).div_ceil(groups);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
-        let reads = (turns as f64 + later) * work.scattered_full_reads(frames, limits);
+        let reads = (groups as f64 + later) * work.scattered_full_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
@@ -146,22 +146,21 @@ impl Rounds {
     /// Returns one line of text for display per pruning round that reduces `count` Gaussians to `fewest`. A line has
     /// the name of the round and the maximum number of views that it renders.
     pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
-        let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
+        let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.groups.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
         rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
 
-    /// Chooses the views by which Gaussians are ranked, and returns them divided into groups (turns). All views of a
-    /// frame are in the same group; only if there are fewer frames than groups, each view is assigned to a group on its
-    /// own.
-    fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
+    /// Chooses the views by which Gaussians are ranked, and returns them divided into groups. All views of a frame
+    /// are in the same group; only if there are fewer frames than groups, each view is assigned to a group on its own.
+    fn view_groups(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
         let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_cover);
         let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
-        let parts = if by_frame.len() < self.turns { pictures.chunks(1).collect() } else { by_frame };
-        let mut turns = vec![Vec::new(); self.turns.min(parts.len())];
-        let count = turns.len().max(1);
-        parts.into_iter().enumerate().for_each(|(k, part)| turns[k % count].extend_from_slice(part));
-        turns
+        let parts = if by_frame.len() < self.groups { pictures.chunks(1).collect() } else { by_frame };
+        let mut groups = vec![Vec::new(); self.groups.min(parts.len())];
+        let count = groups.len().max(1);
+        parts.into_iter().enumerate().for_each(|(k, part)| groups[k % count].extend_from_slice(part));
+        groups
     }
 
     /// Ranks the Gaussians of the ranking `before` anew by pruning rounds, until a round leaves at most `fewest`, and
@@ -197,12 +196,12 @@ impl Rounds {
         if sizes.is_empty() {
             return Ok(before);
         }
-        let turns = self.turns(scene, scored);
-        state.errors = vec![vec![0; scored.gaussian_count()]; turns.len()];
+        let groups = self.view_groups(scene, scored);
+        state.errors = vec![vec![0; scored.gaussian_count()]; groups.len()];
         // All rounds use the same pixels, because a round adds errors that earlier rounds measured.
         let stride = ranking_stride(scene.workload().pixels, first);
         // The key does not depend on `fewest`, because the survivors of a round do not.
-        let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected, stride));
+        let key = scene.work.key(&(self.fraction, self.contrast_floor, &groups, &before, protected, stride));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.is_enabled()) {
             if let Some(found) = scene.work.load(&entry_name(round), key.extended_by(&round))? {
@@ -210,12 +209,12 @@ impl Rounds {
                 break;
             }
         }
-        let pictures =
-            (done..sizes.len()).map(|round| active_turns(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
+        let pictures = (done..sizes.len())
+            .map(|round| active_groups(&groups, round).map(|group| groups[group].len()).sum::<usize>());
         let progress = scene.events.task(NAME, "views", pictures.sum::<usize>() as u64);
         let RoundState { free, removed, .. } = journal.run_stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
-                state = self.round(scene, scored, (state, &turns), round, (key, left, stride), &progress)?;
+                state = self.round(scene, scored, (state, &groups), round, (key, left, stride), &progress)?;
             }
             let left = state.free.len() + protected.len();
             Ok((state, left))
@@ -238,7 +237,7 @@ impl Rounds {
 
     /// Runs a pruning round and returns the new state. The views of the round can be divided among shards.
     ///
-    /// - `state`: state before the round; `turns`: all groups of views;
+    /// - `state`: state before the round; `groups`: all groups of views;
     /// - `round`: number of the round, from 0;
     /// - `key`: cache key of the whole ranking;
     /// - `left`: number of removable Gaussians that the round leaves;
@@ -247,22 +246,22 @@ impl Rounds {
         &self,
         scene: &Scene,
         scored: &Scored,
-        (mut state, turns): (RoundState, &[Vec<FrameView>]),
+        (mut state, groups): (RoundState, &[Vec<FrameView>]),
         round: usize,
         (key, left, stride): (CacheKey, usize, NonZeroU32),
         progress: &Progress,
     ) -> Result<RoundState> {
         let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
         ids.sort_unstable();
-        let active: Vec<usize> = active_turns(turns, round).collect();
+        let active: Vec<usize> = active_groups(groups, round).collect();
         let (background, floor) = (scene.background, self.contrast_floor as f32);
-        let units = active.iter().map(|&turn| turns[turn].len()).sum();
+        let units = active.iter().map(|&group| groups[group].len()).sum();
         // Removal errors of each group of views that this round renders, summed over the views of that group whose unit
         // numbers are in `some`; empty if there are none.
         let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
             let mut start = 0;
-            let turn_errors = |&turn: &usize| {
-                let pictures = &turns[turn];
+            let group_errors = |&group: &usize| {
+                let pictures = &groups[group];
                 let place = |unit: usize| unit.saturating_sub(start).min(pictures.len());
                 let range = place(some.start)..place(some.end);
                 start += pictures.len();
@@ -274,15 +273,15 @@ impl Rounds {
                 Ok(removal_error(scene.source(), &ids, pictures, background, (floor, stride), scene.limits, advance)?
                     .sum)
             };
-            active.iter().map(turn_errors).collect()
+            active.iter().map(group_errors).collect()
         };
         scene.work.compute_in_shards(&entry_name(round), key.extended_by(&round), units, compute, |parts| {
-            for &turn in &active {
-                ids.iter().for_each(|&id| state.errors[turn][id as usize] = 0);
+            for &group in &active {
+                ids.iter().for_each(|&id| state.errors[group][id as usize] = 0);
             }
             for part in parts {
-                for (&turn, found) in active.iter().zip(part?) {
-                    let errors = &mut state.errors[turn];
+                for (&group, found) in active.iter().zip(part?) {
+                    let errors = &mut state.errors[group];
                     for (&id, error) in ids.iter().zip(found) {
                         errors[id as usize] = errors[id as usize].saturating_add(error);
                     }
@@ -316,11 +315,11 @@ fn entry_name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 
-/// Returns the indices in `turns` of the groups of views that round number `round` (from 0) renders: all groups in the
+/// Returns the indices in `groups` of the groups of views that round number `round` (from 0) renders: all groups in the
 /// first round, then one group per round in turn.
-fn active_turns(turns: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = usize> {
-    let count = turns.len().max(1);
-    let active = if round == 0 { turns.len() } else { 1.min(turns.len()) };
+fn active_groups(groups: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = usize> {
+    let count = groups.len().max(1);
+    let active = if round == 0 { groups.len() } else { 1.min(groups.len()) };
     (0..active).map(move |k| (round + k) % count)
 }
 
@@ -396,17 +395,17 @@ mod tests {
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-        for (turns, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
-            let rounds = Rounds { turns, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
-            let parts = rounds.turns(&scene, &scored);
+        for (groups, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
+            let rounds = Rounds { groups, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
+            let parts = rounds.view_groups(&scene, &scored);
             let all = select_evenly_over_frames(&scene.schedule, rounds.pictures, scored.frames_to_cover);
-            assert_eq!(parts.len(), turns.min(all.len()));
+            assert_eq!(parts.len(), groups.min(all.len()));
             let mut together: Vec<FrameView> = parts.concat();
             together.sort_by_key(|picture| (picture.frame, picture.view));
-            assert_eq!(together, all, "{turns} turns");
+            assert_eq!(together, all, "{groups} groups");
             let frames = |part: &Vec<FrameView>| part.chunk_by(|a, b| a.frame == b.frame).count();
             let read: usize = parts.iter().map(frames).sum();
-            assert_eq!(read == all.chunk_by(|a, b| a.frame == b.frame).count(), frames_apart, "{turns} turns");
+            assert_eq!(read == all.chunk_by(|a, b| a.frame == b.frame).count(), frames_apart, "{groups} groups");
         }
     }
 
