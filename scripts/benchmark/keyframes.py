@@ -5,8 +5,8 @@
     python3 scripts/benchmark/keyframes.py target/release/splatsieve DATA [--models A,B] [--kept 20%,5%]
 
 Every model is stored as a container of its frames first. Then the container is compressed with deltas that are constant
-in time (refine_keyframes=0), and with deltas that change linearly between 5 keyframes, the default. PSNR is the mean over
-test views, against renders of the unpruned model; "temporal" is the temporal error that `evaluate` states.
+in time (refine_keyframes=0), and with deltas that change linearly between 5 keyframes, the default. PSNR is the mean
+over test views, against renders of the unpruned model; "temporal" is the temporal error that `evaluate` states.
 """
 
 import tempfile

@@ -5,9 +5,9 @@
     python3 scripts/benchmark/run_time.py target/release/splatsieve DATA [--models A,B] [--repeats 3] [--kept 10%]
 
 Wall time with one and with two threads (medians of the repeats, with the range), processor time and peak memory of the
-whole process with one thread. The expected time with 8 and 16 threads, as a part of that with one (Amdahl's law). Of the
-result: bytes and PSNR on test views, of the model and of its archive, and the time of a render before and after (median
-of the test views, one thread).
+whole process with one thread. Expected time with 8 and 16 threads, as a part of that with one (Amdahl's law). Of the
+result: bytes and PSNR on test views, of the model and of its archive, and the time of a render before and after
+(median of the test views, one thread).
 """
 
 import tempfile
@@ -23,8 +23,8 @@ def size(summary):
 
 def expected_part(two_threads_part, threads):
     """Returns the expected wall time with `threads` threads, divided by that with one thread, by Amdahl's law:
-    s + (1 - s) / threads. The serial part s is the one that gives the measured time with two threads. Losses that grow with
-    more threads are not included."""
+    s + (1 - s) / threads. The serial part s is the one that gives the measured time with two threads. Losses that grow
+    with more threads are not included."""
     serial = max(2 * two_threads_part - 1, 0)
     return serial + (1 - serial) / threads
 

@@ -71,9 +71,9 @@ impl ViewSampler {
 
 /// Returns the views of `schedule` that a scoring pass with the parameters `scan` renders.
 ///
-/// A [`ViewSampler`] selects views by the strides of `scan`. If they are more than the maximum in `scan`
-/// ([`recipe::ScanParams::scoring_views`], where 0 stands for no maximum), [`select_evenly_over_frames`] selects this maximum number of them,
-/// from at least `frames` frames if possible.
+/// A [`ViewSampler`] selects views by the strides of `scan`. If they are more than the maximum
+/// [`recipe::ScanParams::scoring_views`] (0: no maximum), [`select_evenly_over_frames`] selects this many of them, from
+/// at least `frames` frames if possible.
 pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
     let left = ViewSampler::new(scan).thin(schedule);
     if scan.scoring_views == 0 || left.pair_count() <= scan.scoring_views {

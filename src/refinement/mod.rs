@@ -101,8 +101,8 @@ impl RefineStage {
     /// Returns the refinement stage with the parameters of `recipe`, or `None` if `recipe` optimizes no attribute or
     /// has no optimization steps.
     /// - `target`: fraction of the Gaussians that the user wants to keep; `None` if not given.
-    /// - `prunes`: whether refinement may remove Gaussians in prune steps between optimization steps. Prune steps need a
-    ///   run that ranks Gaussians by renders.
+    /// - `prunes`: whether refinement may remove Gaussians in prune steps between optimization steps. Prune steps need
+    ///   a run that ranks Gaussians by renders.
     pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, prunes: bool) -> Option<RefineStage> {
         let recipe::RefineParams {
             refine,
@@ -194,10 +194,9 @@ impl RefineStage {
         }
     }
 
-    /// Returns the number of optimization steps before a prune step:
-    /// [`RefineStage::steps_per_prune`] · √(`wanted`/`left`). `left`: number of Gaussians now. `wanted`: number of
-    /// Gaussians after the last prune step. With more Gaussians there are fewer steps, because a step takes longer and
-    /// more of its effect is removed later.
+    /// Returns the number of optimization steps before a prune step, `steps_per_prune · √(wanted / left)`, for `left`
+    /// Gaussians now and `wanted` Gaussians after the last prune step. With more Gaussians there are fewer steps, because
+    /// a step takes longer and more of its effect is removed later.
     fn steps_before(&self, left: usize, wanted: usize) -> usize {
         (self.steps_per_prune as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
     }
@@ -274,8 +273,7 @@ impl RefineStage {
                 true => (steps, validation_renders, 0.0),
                 false => (self.steps_before(size, left), RATE_VIEWS as f64, RANKING_VIEWS as f64),
             };
-            // Evaluating states and their Jacobians under a deformation field takes twice as long as evaluating
-            // states.
+            // With a deformation field, states and their Jacobians take twice as long to evaluate as states alone.
             let found = if work.input.jacobian > 0 { 2.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
             let strided = work.on_grid(self.stride(work.pixels, count as usize));
             work.reading_seconds(count, frames as f64 * found)

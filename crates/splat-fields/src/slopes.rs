@@ -14,7 +14,6 @@ use splat_core::AttributeValues;
 /// Returns how many texels (grid points of a feature plane) lie in one unit of the normalized coordinate `u` along an
 /// axis of `size` texels. This factor converts derivatives per texel to derivatives with respect to `u`. Returns 0
 /// where [`texel_pair`] clamps `u`, beyond ±1.
-#[inline(always)]
 fn texels_per_unit(u: f32, size: usize) -> f32 {
     if u.abs() <= 1.0 { (size - 1) as f32 / 2.0 } else { 0.0 }
 }
@@ -111,26 +110,6 @@ impl Planes {
     /// Returns the derivatives of the product of the samples of the three planes without time, with respect to the
     /// normalized coordinates: `[N, 3, width]`, for Gaussians at the stored positions `position` (`[3, N]`).
     pub(super) fn slopes_in_space(&self, position: &AttributeValues) -> Vec<f32> {
-        #[cfg(target_arch = "x86_64")]
-        {
-            /// Calls [`Planes::slopes_by_row`], compiled for AVX2. Multiply-adds are not fused, so results have
-            /// the same bits as without AVX2.
-            #[target_feature(enable = "avx2")]
-            fn slopes_avx2(planes: &Planes, position: &AttributeValues) -> Vec<f32> {
-                planes.slopes_by_row(position)
-            }
-            if is_x86_feature_detected!("avx2") {
-                // SAFETY: AVX2 was detected on the line above.
-                return unsafe { slopes_avx2(self, position) };
-            }
-        }
-        self.slopes_by_row(position)
-    }
-
-    /// Computes the result of [`Planes::slopes_in_space`]. The compiler inlines this function into one copy per
-    /// instruction set.
-    #[inline(always)]
-    fn slopes_by_row(&self, position: &AttributeValues) -> Vec<f32> {
         let width = self.width();
         let mut slopes = vec![0.0; 3 * width * position.len()];
         for (i, row) in slopes.chunks_exact_mut(3 * width).enumerate() {

@@ -33,9 +33,8 @@ pub(super) struct JudgedQuality {
 }
 
 impl Judge {
-    /// Renders the held-out (test) views of `scene`, or all views if none are held out. Of more than [`MAX_VIEWS`]
-    /// views, renders an evenly spaced selection of [`MAX_VIEWS`]. Returns these renders as the reference for
-    /// [`Judge::quality`].
+    /// Renders the held-out (test) views of `scene`, or all views if none are held out: at most [`MAX_VIEWS`] of them,
+    /// evenly spaced. Returns these renders as the reference for [`Judge::quality`].
     ///
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.

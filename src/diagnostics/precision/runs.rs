@@ -92,10 +92,10 @@ impl Bench<'_> {
             by_steps.push(self.measure_quality(&recipe, f64::from(steps), 1.0 / f64::from(steps))?);
         }
         let mut by_target_views = Vec::new();
-        for pictures in TARGET_VIEW_COUNTS {
+        for count in TARGET_VIEW_COUNTS {
             let mut recipe = self.recipe.clone();
-            recipe.refine.refine_target_views = pictures;
-            by_target_views.push(self.measure_quality(&recipe, pictures as f64, 1.0 / pictures as f64)?);
+            recipe.refine.refine_target_views = count;
+            by_target_views.push(self.measure_quality(&recipe, count as f64, 1.0 / count as f64)?);
         }
         Ok(Some(PrecisionKnob {
             name: "refining".to_owned(),

@@ -40,8 +40,8 @@ pub(crate) struct Rounds {
     pub fraction: f64,
     /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
     pub pictures: usize,
-    /// Number of groups into which the views are divided. Every round after the first renders the views of one group;
-    /// for the other groups it uses errors measured in earlier rounds.
+    /// Number of groups into which the views are divided. The first round renders the views of all groups. Every later
+    /// round renders one group, and uses the errors that earlier rounds measured for the others.
     pub groups: usize,
     /// Color difference (norm over red, green and blue, each from 0 to 1) whose square is added to the squared color
     /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
@@ -151,8 +151,8 @@ impl Rounds {
         rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
 
-    /// Chooses the views by which Gaussians are ranked, and returns them divided into groups. All views of a frame
-    /// are in the same group; only if there are fewer frames than groups, each view is assigned to a group on its own.
+    /// Chooses the views by which Gaussians are ranked, and returns them divided into groups. Views of the same frame
+    /// are in the same group, unless there are fewer frames than groups.
     fn view_groups(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
         let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_cover);
         let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
@@ -315,8 +315,8 @@ fn entry_name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 
-/// Returns the indices in `groups` of the groups of views that round number `round` (from 0) renders: all groups in the
-/// first round, then one group per round in turn.
+/// Returns which groups of views are rendered in a round, as indices into `groups`: all groups in the first round (0),
+/// then one group per round in turn.
 fn active_groups(groups: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = usize> {
     let count = groups.len().max(1);
     let active = if round == 0 { groups.len() } else { 1.min(groups.len()) };
