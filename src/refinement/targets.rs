@@ -20,22 +20,25 @@ use crate::scene::views_outside::cameras_outside;
 pub(crate) const NAME: &str = "targets";
 /// Name of the cache entry of the target views of which some show photographs.
 const PHOTOGRAPHS_NAME: &str = "photograph-targets";
-/// Numbers of target views by kind of camera, out of every 26. First: views from the scene's cameras. Second: views
-/// from new cameras, which are between two of the scene's cameras or outside the rig.
-const VIEW_SHARES: [usize; 2] = [3, 23];
-/// Numbers of target views by content, out of every 26, if some show photographs. First: photographs from the scene's
-/// cameras. Second: renders of the original from new cameras, which keep the result from overfitting the photographs.
-const PHOTOGRAPH_SHARES: [usize; 2] = [20, 6];
+/// Fraction of the target views that are from the scene's cameras, as [numerator, denominator], and their maximum
+/// number. All others are from new cameras, which are between two of the scene's cameras or outside the rig.
+const SCENE_VIEWS: ([usize; 2], usize) = ([3, 26], 60);
+/// Fraction of the target views that are photographs, if there are any, as [numerator, denominator], and their maximum
+/// number.
+const PHOTOGRAPHS: ([usize; 2], usize) = ([20, 26], 400);
+/// Number of renders of the original from new cameras, as a fraction [numerator, denominator] of the number of
+/// photographs. They keep the result from overfitting the photographs.
+const RENDERS_PER_PHOTOGRAPH: [usize; 2] = [3, 10];
 /// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
 /// exceed it.
 const MAX_BYTES: u64 = 1 << 30;
 /// Minimum number of target views, even if they exceed [`MAX_BYTES`].
 const MIN_VIEWS: u64 = 96;
-/// Number n for validation views: one of every n target views is a validation view. First value: with at least
-/// [`MANY_VIEWS`] target views. Second value: with fewer.
-const VALIDATION_EVERY: [usize; 2] = [16, 8];
-/// Minimum number of target views at which one of every 16, instead of one of every 8, is a validation view.
-const MANY_VIEWS: usize = 400;
+/// Number of validation views if there are many target views. With fewer than eight times as many target views, one of
+/// every eight is a validation view.
+const VALIDATION_VIEWS: usize = 32;
+/// Minimum number n such that one of every n target views is a validation view.
+const MIN_VALIDATION_EVERY: usize = 8;
 
 /// Number n by which validation photographs are chosen: they are the photographs of one in n cameras. If fewer than n
 /// cameras have photographs, they are one in n photographs.
@@ -59,20 +62,27 @@ pub(crate) struct ViewSplit {
 /// Returns two numbers of target views: from the scene's cameras, and from new cameras. Their sum is at most
 /// `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
-    shared_counts(VIEW_SHARES, max_views, pixels)
-}
-
-/// Returns the numbers of target views of two kinds, of which `shares` out of every 26 are of each kind. Their sum is
-/// at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
-fn shared_counts(shares: [usize; 2], max_views: usize, pixels: u64) -> [usize; 2] {
-    let count = (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize;
-    shares.map(|part| part * count / 26)
+    let count = total_count(max_views, pixels);
+    let own = fraction(SCENE_VIEWS.0, count).min(SCENE_VIEWS.1);
+    [own, count - own]
 }
 
 /// Returns two numbers of target views if some show photographs: photographs, and renders from new cameras. Their sum is
 /// at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
 pub(super) fn photograph_counts(max_views: usize, pixels: u64) -> [usize; 2] {
-    shared_counts(PHOTOGRAPH_SHARES, max_views, pixels)
+    let photographs = fraction(PHOTOGRAPHS.0, total_count(max_views, pixels)).min(PHOTOGRAPHS.1);
+    [photographs, fraction(RENDERS_PER_PHOTOGRAPH, photographs)]
+}
+
+/// Returns `max_views`, or the number of views of `pixels` pixels that take [`MAX_BYTES`] if this is less, but then at
+/// least [`MIN_VIEWS`].
+fn total_count(max_views: usize, pixels: u64) -> usize {
+    (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize
+}
+
+/// Returns the fraction `part` (numerator, denominator) of `count` views, rounded down.
+fn fraction([part, of]: [usize; 2], count: usize) -> usize {
+    part * count / of
 }
 
 /// Target views in a scratch file: renders of the original model, or photographs. Their cameras are the cameras by which
@@ -142,7 +152,7 @@ impl Targets {
         stride: NonZeroU32,
         (seen, photographs): (Vec<FrameView>, &Photographs),
     ) -> Result<Targets> {
-        let new_views = seen.len() * PHOTOGRAPH_SHARES[1] / PHOTOGRAPH_SHARES[0];
+        let new_views = fraction(RENDERS_PER_PHOTOGRAPH, seen.len());
         // Index in the schedule of each of the cameras that `add_new_views` lists first.
         let used = scene.schedule.used_cameras();
         let mut cameras_with_photographs: Vec<u32> = seen.iter().map(|picture| picture.camera).collect();
@@ -291,7 +301,7 @@ impl Targets {
 
 /// Returns the number n such that one of every n target views is a validation view. `views`: number of target views.
 pub(super) fn validation_every(views: usize) -> usize {
-    VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
+    (views / VALIDATION_VIEWS).max(MIN_VALIDATION_EVERY)
 }
 
 /// Returns the purpose of the target view with the index `k` among `count` target views, all of which show renders. If
@@ -388,10 +398,18 @@ mod tests {
 
     #[test]
     fn large_views_are_fewer_but_never_too_few() {
-        assert_eq!(view_counts(520, 320 * 256), [60, 460]);
+        assert_eq!(view_counts(1000, 320 * 256), [60, 940]);
         assert_eq!(view_counts(520, 0), [60, 460]);
-        assert_eq!(view_counts(520, 1352 * 1014), [15, 115]);
-        assert_eq!(view_counts(520, 1 << 40), [11, 84]);
-        assert_eq!(view_counts(40, 1 << 40), [4, 35]);
+        assert_eq!(view_counts(1000, 1352 * 1014), [15, 115]);
+        assert_eq!(view_counts(1000, 1 << 40), [11, 85]);
+        assert_eq!(view_counts(40, 1 << 40), [4, 36]);
+        assert_eq!(photograph_counts(1000, 320 * 256), [400, 120]);
+        assert_eq!(photograph_counts(1000, 1352 * 1014), [100, 30]);
+    }
+
+    #[test]
+    fn number_of_validation_views_grows_to_32() {
+        let count = |views: usize| (0..views).filter(|k| purpose(*k, views, false) == Purpose::Validation).count();
+        assert_eq!([8, 130, 256, 520, 1000].map(count), [1, 17, 32, 33, 33]);
     }
 }

@@ -26,7 +26,7 @@ const PASSES: [usize; 3] = [1, 2, 3];
 /// Numbers of optimization steps of refinement that are tried.
 const STEPS: [u32; 6] = [100, 250, 500, 1000, 1500, 3000];
 /// Numbers of target views (views of the original that refinement fits) that are tried.
-const TARGET_VIEW_COUNTS: [usize; 5] = [32, 65, 130, 260, 520];
+const TARGET_VIEW_COUNTS: [usize; 5] = [65, 130, 260, 520, 1000];
 /// Memory limits that are tried, as multiples of the smallest limit with which the program can run.
 const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
 
