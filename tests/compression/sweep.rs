@@ -95,7 +95,7 @@ fn refinement_step_points_equal_compress() {
     assert_eq!(knob["parameter"], "refine_steps");
     let settings = knob["settings"].as_array().unwrap();
     assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
-    // Before each prune step there are 2/15 of the steps, as in the preset: 25 · 2/15, rounded up.
+    // Before each prune step there are 160 of 1300 steps, as in the preset: 25 · 160/1300, rounded up.
     workplace.done(
         "compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_steps_per_prune=4",
     );
