@@ -20,24 +20,27 @@ use crate::scene::views_outside::cameras_outside;
 pub(crate) const NAME: &str = "targets";
 /// Name of the cache entry of the target views of which some show photographs.
 const PHOTOGRAPHS_NAME: &str = "photograph-targets";
-/// Fraction of the target views that are from the scene's cameras, as [numerator, denominator], and their maximum
-/// number. All others are from new cameras, which are between two of the scene's cameras or outside the rig.
-const SCENE_VIEWS: ([usize; 2], usize) = ([3, 26], 60);
-/// Fraction of the target views that are photographs, if there are any, as [numerator, denominator], and their maximum
-/// number.
-const PHOTOGRAPHS: ([usize; 2], usize) = ([20, 26], 400);
-/// Number of renders of the original from new cameras, as a fraction [numerator, denominator] of the number of
-/// photographs. They keep the result from overfitting the photographs.
+/// Numerator and denominator of the fraction of target views that are from the scene's cameras. All others are from new
+/// cameras, which are between two of the scene's cameras or outside the rig.
+const SCENE_VIEW_PART: [usize; 2] = [3, 26];
+/// Maximum number of target views from the scene's cameras.
+const MAX_SCENE_VIEWS: usize = 60;
+/// Numerator and denominator of the fraction of target views that are photographs, in a refinement toward photographs.
+const PHOTOGRAPH_PART: [usize; 2] = [20, 26];
+/// Maximum number of target views that are photographs.
+const MAX_PHOTOGRAPHS: usize = 400;
+/// In a refinement toward photographs: number of renders of the original from new cameras, divided by the number of
+/// photographs (numerator and denominator). These renders keep the result from overfitting the photographs.
 const RENDERS_PER_PHOTOGRAPH: [usize; 2] = [3, 10];
 /// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
 /// exceed it.
 const MAX_BYTES: u64 = 1 << 30;
 /// Minimum number of target views, even if they exceed [`MAX_BYTES`].
 const MIN_VIEWS: u64 = 96;
-/// Number of validation views if there are many target views. With fewer than eight times as many target views, one of
-/// every eight is a validation view.
+/// Approximate number of validation views of a refinement toward renders. Fewer than 256 target views have fewer
+/// validation views, because of [`MIN_VALIDATION_EVERY`].
 const VALIDATION_VIEWS: usize = 32;
-/// Minimum number n such that one of every n target views is a validation view.
+/// Minimum n in "one of every n target views is a validation view": at most one view in eight is used for validation.
 const MIN_VALIDATION_EVERY: usize = 8;
 
 /// Number n by which validation photographs are chosen: they are the photographs of one in n cameras. If fewer than n
@@ -63,24 +66,24 @@ pub(crate) struct ViewSplit {
 /// `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
     let count = total_count(max_views, pixels);
-    let own = fraction(SCENE_VIEWS.0, count).min(SCENE_VIEWS.1);
+    let own = fraction(SCENE_VIEW_PART, count).min(MAX_SCENE_VIEWS);
     [own, count - own]
 }
 
 /// Returns two numbers of target views if some show photographs: photographs, and renders from new cameras. Their sum is
 /// at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
 pub(super) fn photograph_counts(max_views: usize, pixels: u64) -> [usize; 2] {
-    let photographs = fraction(PHOTOGRAPHS.0, total_count(max_views, pixels)).min(PHOTOGRAPHS.1);
+    let photographs = fraction(PHOTOGRAPH_PART, total_count(max_views, pixels)).min(MAX_PHOTOGRAPHS);
     [photographs, fraction(RENDERS_PER_PHOTOGRAPH, photographs)]
 }
 
-/// Returns `max_views`, or the number of views of `pixels` pixels that take [`MAX_BYTES`] if this is less, but then at
-/// least [`MIN_VIEWS`].
+/// Returns the number of target views of `pixels` pixels each: as many as fit into [`MAX_BYTES`], but at least
+/// [`MIN_VIEWS`], and never more than `max_views`.
 fn total_count(max_views: usize, pixels: u64) -> usize {
     (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize
 }
 
-/// Returns the fraction `part` (numerator, denominator) of `count` views, rounded down.
+/// Returns `count` · `part` / `of`, rounded down.
 fn fraction([part, of]: [usize; 2], count: usize) -> usize {
     part * count / of
 }
