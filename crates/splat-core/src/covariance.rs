@@ -69,7 +69,7 @@ fn eigen(mut a: [[f64; 3]; 3]) -> ([f64; 3], [DVec3; 3]) {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let scale = a.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
     for _ in 0..MAX_SWEEPS {
-        // A smaller off-diagonal entry does not change the eigenvalues at f64 precision.
+        // Off-diagonal entries below this limit do not change the eigenvalues at f64 precision.
         if a[0][1].abs().max(a[0][2].abs()).max(a[1][2].abs()) <= 1e-18 * scale {
             break;
         }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::{AttributeValues, Attributes, Gaussians};
 
 /// Derivatives ∂L/∂value of a loss L with respect to the stored values of N Gaussians, in the layout of [`Gaussians`].
-/// Each derivative is a sum in f32, to which terms are added one after the other.
+/// Each derivative is a sum in f32, to which callers add terms, for example one for each view.
 ///
 /// The caller chooses the attributes to differentiate; the SH degree may be lower than that of the Gaussians. Values
 /// that are not differentiated take neither memory nor time. Memory: 4 bytes per differentiated value.
@@ -173,10 +173,10 @@ mod tests {
     }
 
     #[test]
-    fn parts_that_overflow_f32_are_skipped() {
+    fn terms_that_overflow_f32_are_skipped() {
         let mut gradients = Gradients::new(1, Attributes::OPACITY, 0);
-        for part in [3e38, f32::NAN, 3e38, f32::NEG_INFINITY, -1e38] {
-            gradients.spans(1)[0].add(Attributes::OPACITY, 0, 0, [part]);
+        for term in [3e38, f32::NAN, 3e38, f32::NEG_INFINITY, -1e38] {
+            gradients.spans(1)[0].add(Attributes::OPACITY, 0, 0, [term]);
         }
         assert_eq!(gradients.column(Attributes::OPACITY).plane(0), [3e38f32 - 1e38]);
     }

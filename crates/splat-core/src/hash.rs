@@ -1,5 +1,5 @@
-//! Fixed hash of Gaussian ids. Ties between Gaussians are broken by this hash, so that their order in the file has no
-//! influence. The hash is also used in place of random numbers.
+//! Fixed hash of Gaussian ids. It orders Gaussians with equal scores, so that pruning favors neither the first nor the
+//! last Gaussians of a file. It also serves as a source of pseudo-random numbers.
 
 /// Returns a hash of `id`: output number `id` (from 0) of the generator SplitMix64 (Steele, Lea and Flood 2014) with
 /// seed 0.

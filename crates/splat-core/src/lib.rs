@@ -66,13 +66,14 @@ pub fn finite_logit(logit: f32) -> f32 {
     if logit.is_infinite() { INFINITE_LOGIT.copysign(logit) } else { logit }
 }
 
-/// Returns the value of one color channel from its SH coefficient of degree 0. This part of the color is the same from
-/// all directions.
-pub fn color_from_sh(harmonic: f32) -> f64 {
-    0.5 + SH_C0 * f64::from(harmonic)
+/// Returns 0.5 + SH_C0 · `f_dc`: the value of one color channel without the SH coefficients above degree 0, which make
+/// the color depend on the view direction. `f_dc` is the stored SH coefficient of degree 0.
+pub fn color_from_sh(f_dc: f32) -> f64 {
+    0.5 + SH_C0 * f64::from(f_dc)
 }
 
-/// Returns the SH coefficient of degree 0 that gives one color channel the value `color`.
+/// Returns (`color` − 0.5) / SH_C0: the stored SH coefficient of degree 0 that gives one color channel the value
+/// `color`.
 pub fn sh_from_color(color: f64) -> f32 {
     ((color - 0.5) / SH_C0) as f32
 }

@@ -1,4 +1,5 @@
-//! Extent of a scene without outliers. It is the unit of lengths that are given relative to the size of the scene.
+//! Extent of a scene, computed without outliers. Lengths that are given relative to the size of the scene have this
+//! extent as their unit.
 
 use glam::DVec3;
 

@@ -60,7 +60,9 @@ pub enum StatisticArray {
     U32(fn(&StatisticRows) -> &Vec<u32>, fn(&mut StatisticRows) -> &mut Vec<u32>),
 }
 
-/// Declaration of a statistic: its names, its meaning, and the array of its values.
+/// Declaration of a statistic. Each field is the result of a method of [`Statistic`]: `name`, `column`
+/// ([`Statistic::column_name`]), `meaning`, `property` ([`Statistic::measured_property`]) and `values`
+/// ([`Statistic::accessors`]).
 struct Declaration {
     name: &'static str,
     column: &'static str,

@@ -10,7 +10,7 @@ use super::camera::Camera;
 /// grows with the number of images that the camera file names, not with the number of frames.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewSchedule {
-    /// Distinct cameras, to which the camera indices of the views refer. Some may have no view.
+    /// Distinct cameras. The camera indices of the views are indices in this list. A camera may have no view.
     pub cameras: Vec<Camera>,
     runs: Vec<ViewRun>,
     /// Views of all runs (consecutive frames with equal views), one run after the other, as pairs (view number, camera
@@ -53,8 +53,8 @@ impl ViewSchedule {
         ViewSchedule { cameras, ..ViewSchedule::default() }
     }
 
-    /// Creates a schedule with `cameras` and the views `views`, which must be sorted by frame. The last frame is that of
-    /// the last view.
+    /// Creates a schedule with `cameras` and the views `views`, which must be sorted by frame. The schedule ends with
+    /// the frame of the last view.
     pub fn from_views(cameras: Vec<Camera>, views: &[FrameView]) -> ViewSchedule {
         let mut schedule = ViewSchedule::new(cameras);
         for of_frame in views.chunk_by(|a, b| a.frame == b.frame) {
