@@ -72,8 +72,8 @@ impl Deltas {
     /// Computes into `out` the derivative ∂state/∂raw of [`Deltas::apply`]: raw are the stored attributes, and the
     /// state is its result. Deltas and masks (factors on the stored attributes) are held constant.
     ///
-    /// An attribute whose derivative is the identity gets no values. Values that are not finite become 0. `rotation`
-    /// holds the stored quaternions.
+    /// Attributes whose derivative is the identity are not written: in an empty `out`, an attribute without values
+    /// means the identity. Values that are not finite become 0. `rotation` holds the stored quaternions.
     pub(super) fn jacobian(&self, rotation: &AttributeValues, out: &mut Jacobian) {
         for column in self.active.iter() {
             if column == Attributes::ROTATION && self.multiply_rotation {

@@ -32,8 +32,8 @@ pub struct FieldConfig {
     /// Whether the field reads a mask (a factor on the stored attributes of each Gaussian) from a grid of voxels in
     /// space, at the stored position of the Gaussian.
     pub empty_voxel: bool,
-    /// Frequency p of an encoding of the plane features f. If p is above 1, the trunk reads `[f, sin(p·f), cos(p·f)]`
-    /// instead of f.
+    /// Frequency p of the encoding of the plane features f. If p is above 1, the trunk (first MLP) reads f, sin(p·f)
+    /// and cos(p·f); otherwise it reads only f.
     pub grid_pe: i64,
     /// Whether the trunk (first MLP) reads `[x, y, z, t]` instead of plane features.
     pub no_grid: bool,
@@ -42,10 +42,11 @@ pub struct FieldConfig {
     pub apply_rotation: bool,
 }
 
-/// Source of the mask, a factor on all stored attributes of a Gaussian except the rotation.
+/// Source of the mask. A mask is a factor by which all stored attributes of a Gaussian except the rotation are
+/// multiplied.
 #[derive(Debug, Clone)]
 pub(super) enum Mask {
-    /// The field has no mask: stored attributes are not multiplied by a factor before the deltas are added.
+    /// The field has no mask: deltas are added to the stored attributes themselves.
     None,
     /// The last head (output MLP) of the field computes the mask (factor on stored attributes), which varies with time
     /// (option `static_mlp`).
@@ -238,8 +239,8 @@ impl Field {
     ///
     /// [`Deltas::apply`] computes the attributes at `time` from these results: stored value times mask, plus delta.
     ///
-    /// `prepared` is what [`Field::prepare`] or [`Field::prepare_with_slopes`] returned for the block. `time` is passed to
-    /// the field unscaled; the feature planes clamp it to [−1, 1].
+    /// `prepared` is the result of [`Field::prepare`] or [`Field::prepare_with_slopes`] for the block. `time` is passed
+    /// to the field unscaled; the feature planes clamp it to [−1, 1].
     ///
     /// # Errors
     /// Fails if `time` is not finite, or if `out` has another SH degree than the field.

@@ -6,7 +6,7 @@
 //! trunk (MLP shared by all attributes) and the feature planes. Derivatives through the deltas of other attributes are
 //! neglected: they would raise the quality of refined models by less than 0.1 dB, and take most of the time.
 //!
-//! Input: raw positions and rotations, and what [`Field::prepare_with_slopes`] computed from the positions. Output: a
+//! Input: raw positions and rotations, and the result of [`Field::prepare_with_slopes`] for the positions. Output: a
 //! [`Jacobian`]. Memory: the Jacobian, and the values of all layers for one group of [`LANES`] Gaussians. Derived in
 //! docs/method.md, section 8.2.
 
@@ -38,9 +38,9 @@ impl Field {
     /// the attributes at that time: the stored ones `raw` plus the delta that the field predicts.
     ///
     /// - `raw` must contain positions, and rotations if `want` contains them.
-    /// - `prepared` is what [`Field::prepare_with_slopes`] returned for these positions.
-    /// - A derivative that is not finite becomes 0. The derivative of a position is I + ∂delta/∂position; of this sum,
-    ///   only ∂delta/∂position becomes 0.
+    /// - `prepared` is the result of [`Field::prepare_with_slopes`] for these positions.
+    /// - A derivative that is not finite becomes 0. For positions, whose derivative is I + ∂delta/∂position, only
+    ///   ∂delta/∂position becomes 0, so I remains.
     ///
     /// If the field has a mask (a factor on the stored attributes, option `static_mlp` or `empty_voxel`), masks and
     /// deltas count as constant. A change of the stored position then changes the position at `time` by the mask times

@@ -1,9 +1,10 @@
 //! Fully connected layers, evaluated for [`LANES`] Gaussians side by side.
 //!
-//! On loading, weights are reordered into panels of four outputs each. The sums of a panel take eight of the sixteen
-//! AVX2 registers, enough to hide the latency of the multiply-adds. In the inner loop, one input value of each Gaussian
-//! is multiplied by one weight, so layers with few outputs are not slower per output. A matrix library that reorders
-//! its operands in every call would spend a seventh of its time on this reordering, because these matrices are small.
+//! On loading, weights are reordered into panels of four outputs each. The sums of a panel (four outputs of [`LANES`]
+//! Gaussians) take eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds. The lanes of a
+//! register belong to different Gaussians, not to different outputs, so layers with few outputs are not slower per
+//! output. A matrix library that reorders its operands in every call would spend a seventh of its time on this
+//! reordering, because these matrices are small.
 
 use splat_core::error::Result;
 
@@ -75,7 +76,7 @@ impl Linear {
         out.resize(self.padded_outputs(), CacheLine([0.0; LANES]));
         let panels = self.weight.chunks_exact(self.inputs).zip(&self.bias);
         for (out, (weight, bias)) in out.chunks_exact_mut(PANEL).zip(panels) {
-            let sums = sums::<FMA>(input, weight, bias);
+            let sums = panel_outputs::<FMA>(input, weight, bias);
             for (out, y) in out.iter_mut().zip(&sums) {
                 for (out, &y) in out.0.iter_mut().zip(&y.0) {
                     *out = if y < 0.0 { 0.0 } else { y };
@@ -118,9 +119,9 @@ impl Linear {
         }
     }
 
-    /// Computes the outputs of the layer for `input`, without ReLU, and writes those of the first `lanes` Gaussians to
-    /// `planes`. This array holds one plane of `len` values per output. The first Gaussian has index `start` in each
-    /// plane, so the values of output o begin at `o·len + start`.
+    /// Computes the outputs of the layer for `input`, without ReLU, and writes the outputs of the first `lanes`
+    /// Gaussians to `planes`. `planes` holds one plane of `len` values per output. Output o of the first Gaussian is
+    /// written to index `o·len + start`, and the outputs o of the next Gaussians follow.
     #[inline(always)]
     pub(super) fn write<const FMA: bool>(
         &self,
@@ -133,7 +134,7 @@ impl Linear {
         let panels = self.weight.chunks_exact(self.inputs).zip(&self.bias);
         for (panel, (weight, bias)) in panels.enumerate() {
             let first = panel * PANEL;
-            let sums = sums::<FMA>(input, weight, bias);
+            let sums = panel_outputs::<FMA>(input, weight, bias);
             for (o, y) in (first..self.outputs).zip(&sums) {
                 planes[o * len + start..][..lanes].copy_from_slice(&y.0[..lanes]);
             }
@@ -144,11 +145,15 @@ impl Linear {
 /// Computes the outputs of one panel ([`PANEL`] outputs) of a layer from the `input` of the layer, and the `weight` and
 /// `bias` of the panel.
 ///
-/// Each sum starts with the bias and adds the inputs in order, so the result for a Gaussian does not depend on the
-/// Gaussians beside it. `FMA` selects fused multiply-adds. On a processor without these instructions, each fused
-/// multiply-add would be a function call.
+/// Each output is the bias plus the products of inputs and weights, added in the order of the inputs. The result for a
+/// Gaussian therefore does not depend on the Gaussians beside it. `FMA` selects fused multiply-adds. On a processor
+/// without these instructions, each fused multiply-add would be a function call.
 #[inline(always)]
-fn sums<const FMA: bool>(input: &[CacheLine], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [CacheLine; PANEL] {
+fn panel_outputs<const FMA: bool>(
+    input: &[CacheLine],
+    weight: &[[f32; PANEL]],
+    bias: &[f32; PANEL],
+) -> [CacheLine; PANEL] {
     let mut sums = bias.map(|b| CacheLine([b; LANES]));
     for (x, weight) in input.iter().zip(weight) {
         for (sums, &w) in sums.iter_mut().zip(weight) {

@@ -1,11 +1,11 @@
 //! Deep MLP that computes the motion of Gaussians: encoding of position and time, fully connected layers, and one
 //! linear output layer (head) per attribute.
 //!
-//! The first layer reads h = [e(x), e(t)], where x is the stored position, t the time, and e(v) = [v, sin(2⁰v),
-//! cos(2⁰v), sin(2¹v), cos(2¹v), …]; every entry contains all components of v. Positions are encoded with ten octaves
-//! (powers of 2). In models with a time network, e(t) is the output of that network. Each layer computes its output h
-//! by a linear map and a ReLU from the h of the previous layer, or from [e(x), e(t), h] if it has a skip connection.
-//! Heads are linear maps of the last h.
+//! The first layer reads [e(x), e(t)], where x is the stored position, t the time, and e(v) = [v, sin(2⁰v), cos(2⁰v),
+//! sin(2¹v), cos(2¹v), …]; every entry contains all components of v. Positions are encoded with ten octaves (powers of
+//! 2). In models with a time network, e(t) is the output of that network. The next layers read the output h of the
+//! previous layer, or [e(x), e(t), h] if they have a skip connection. Each layer is a linear map followed by a ReLU.
+//! Heads are linear maps of the output of the last layer.
 //!
 //! Input: tensors of a state dict, stored positions, a time. Output: [`PredictedMotion`]. Memory: the tensors twice,
 //! [`Network::BYTES_PER_GAUSSIAN`] per encoded Gaussian, and about 64 kB per call for the outputs of the layers.
@@ -393,7 +393,7 @@ impl Network {
                     layer.linear.backward::<FMA>(&gradient, before.filter(|_| !layer.has_skip), &mut spare);
                     std::mem::swap(&mut gradient, &mut spare);
                     if k == 0 || layer.has_skip {
-                        add(&gradient[..POSITION_INPUTS], &mut position_gradient);
+                        add_to_sums(&gradient[..POSITION_INPUTS], &mut position_gradient);
                     }
                     if let Some(before) = before.filter(|_| layer.has_skip) {
                         gradient.drain(..encodings);
@@ -434,7 +434,7 @@ fn encode_scalar(value: f32, octaves: usize) -> Vec<f32> {
 
 /// Adds each entry of `terms` to the entry of `sums` with the same index.
 #[inline(always)]
-fn add(terms: &[CacheLine], sums: &mut [CacheLine]) {
+fn add_to_sums(terms: &[CacheLine], sums: &mut [CacheLine]) {
     for (sums, terms) in sums.iter_mut().zip(terms) {
         sums.0.iter_mut().zip(&terms.0).for_each(|(sum, term)| *sum += term);
     }

@@ -111,7 +111,7 @@ pub(super) struct PreparedPlanes {
 }
 
 impl PreparedPlanes {
-    /// Returns whether there are slopes of `rows` Gaussians in planes as wide as `planes`.
+    /// Returns whether slopes were computed, for `rows` Gaussians and the number of features of `planes`.
     pub(super) fn has_slopes(&self, planes: &Planes, rows: usize) -> bool {
         self.slopes.len() == 3 * planes.width() * rows
     }
@@ -238,8 +238,8 @@ impl Planes {
         (origin, std::array::from_fn(|axis| origin[axis] + 2.0 / factor[axis]))
     }
 
-    /// Computes the part of the features that does not depend on time, for Gaussians at the stored positions `position`
-    /// (`[3, N]`).
+    /// Computes the time-independent part of the features ([`PreparedPlanes`]) of Gaussians at the stored positions
+    /// `position` (`[3, N]`).
     pub(super) fn prepare(&self, position: &AttributeValues) -> PreparedPlanes {
         #[cfg(target_arch = "x86_64")]
         {

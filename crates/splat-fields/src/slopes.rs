@@ -1,11 +1,13 @@
 //! HexPlane features (products of samples of six feature planes) and their derivatives with respect to position.
 //!
-//! Input: stored positions of a group of Gaussians, what was prepared for them, and the planes with time, interpolated
-//! at one time. Output: features `[Σ channels, LANES]`, and their derivatives along x, y and z, three arrays of this
-//! size. The derivative of a feature along an axis is a sum of three terms, one for each plane with this axis: the
-//! derivative of the sample of this plane times the other five samples. Coordinates outside the box are clamped, so
-//! their derivative is 0. What depends only on the planes without time is computed once per block of Gaussians
-//! ([`Planes::slopes_in_space`]).
+//! Input: the stored positions of a group of Gaussians, their time-independent results ([`PreparedPlanes`]), and the
+//! planes with a time axis, interpolated at one time. Output: features `[Σ channels, LANES]`, and their derivatives
+//! along x, y and z: three arrays of the same size.
+//!
+//! A feature is the product of six samples, one per plane. Its derivative along an axis is a sum of three terms, one
+//! for each plane with this axis: the derivative of the sample of this plane times the other five samples. Coordinates
+//! outside the box are clamped, so derivatives are 0 there. The parts of the derivatives that depend only on the planes
+//! without time are computed once per block of Gaussians ([`Planes::slopes_in_space`]).
 
 use super::linear::{CacheLine, LANES};
 use super::planes::{FeaturePlane, Planes, PreparedPlanes, SPATIAL, TimeLines, texel_pair, texels};
@@ -143,7 +145,8 @@ impl Planes {
     /// position.
     ///
     /// - `x`, `y`, `z`: positions of the Gaussians, scene units.
-    /// - `prepared`: block that was prepared with slopes; `start` is the index in it of the first of these Gaussians.
+    /// - `prepared`: time-independent results of a block of Gaussians, with slopes; `start`: index in this block of the
+    ///   first of the Gaussians.
     /// - `lines`: the planes with a time axis, interpolated at this time ([`Planes::lines`]).
     /// - `features`: receives the features. Values of unused lanes are unspecified.
     /// - `slopes`: receives the derivatives of the features with respect to x, y and z.

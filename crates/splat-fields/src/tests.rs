@@ -153,7 +153,7 @@ fn states_do_not_depend_on_block_or_requested_attributes() {
 }
 
 #[test]
-fn solve_inverts_apply() {
+fn invert_is_the_inverse_of_apply() {
     for apply_rotation in [false, true] {
         let field = build(&FieldConfig { static_mlp: true, apply_rotation, ..plain_config() }, 1);
         let raw = random_gaussians(50);
@@ -428,7 +428,7 @@ fn derivatives_do_not_depend_on_blocks() {
 }
 
 #[test]
-fn derivatives_at_odd_positions_are_finite() {
+fn derivatives_at_extreme_positions_are_finite() {
     for config in [plain_config(), FieldConfig { apply_rotation: true, static_mlp: true, ..plain_config() }] {
         let field = build(&config, 1);
         let mut raw = random_gaussians(8);

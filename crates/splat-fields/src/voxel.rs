@@ -19,8 +19,8 @@ pub(super) struct VoxelMask {
 
 impl VoxelMask {
     /// Reads the grid from the tensors `deformation_net.empty_voxel.*`. Only some versions of the trainer save the
-    /// corners of the grid. If they are missing, `corners` is used, the (maximum, minimum) corners of the box of the
-    /// feature planes, because training sets both boxes to the same values.
+    /// corners of the grid. If the file lacks them, the grid gets the corners `corners` = (maximum, minimum) of the box
+    /// of the feature planes, because training sets both boxes to the same values.
     pub(super) fn load(lookup: Lookup<'_>, corners: Option<([f32; 3], [f32; 3])>) -> Result<Self> {
         let name = |part: &str| format!("deformation_net.empty_voxel.{part}");
         let grid = lookup.get_shaped(&name("grid"), &[Some(1), Some(1), None, None, None], "empty_voxel=True")?;
@@ -39,14 +39,15 @@ impl VoxelMask {
         Ok(VoxelMask { low, high, size: [grid.shape[2], grid.shape[3], grid.shape[4]], values: grid.data.clone() })
     }
 
-    /// Returns the mask (factor on the stored attributes) of every Gaussian at `position` (`[3, N]`): the grid
-    /// interpolated trilinearly, with grid points on the corners of the box, and 0 outside the box.
+    /// Returns the mask (factor on the stored attributes) of every Gaussian at `position` (`[3, N]`), by trilinear
+    /// interpolation of the grid. The outermost grid points lie on the faces of the box. Grid points further out count
+    /// as 0, so the mask falls to 0 within one grid step outside the box.
     pub(super) fn sample(&self, position: &AttributeValues) -> Vec<f32> {
         (0..position.len()).map(|i| self.sample_one(position.row(i))).collect()
     }
 
     /// Returns the mask (factor on stored attributes) at position `p`, scene units, by trilinear interpolation of the
-    /// grid.
+    /// grid, whose grid points outside the box count as 0.
     fn sample_one(&self, p: [f32; 3]) -> f32 {
         let at: [f32; 3] = std::array::from_fn(|axis| {
             let u = (p[axis] - self.low[axis]) / (self.high[axis] - self.low[axis]) * 2.0 - 1.0;
