@@ -19,7 +19,7 @@ pub use folder::FolderHandle;
 pub use signals::end_on_signals;
 
 /// Permissions (mode bits) of a private folder, which only its owner may enter, read or write.
-const PRIVATE: u32 = 0o700;
+const PRIVATE_MODE: u32 = 0o700;
 
 /// Fills `bytes` with the bytes of `file` from byte `offset` on. Several threads may read one file at the same time.
 ///
@@ -119,14 +119,14 @@ pub fn is_system_folder(folder: &Path) -> bool {
 /// # Errors
 /// Fails if an entry named `path` exists or the system refuses.
 pub fn create_private_folder(path: &Path) -> io::Result<()> {
-    DirBuilder::new().mode(PRIVATE).create(path)
+    DirBuilder::new().mode(PRIVATE_MODE).create(path)
 }
 
 /// Returns the permissions of a private folder, which only its owner may access, for callers that do not create the
 /// folder with [`create_private_folder`]. Returns `None` on systems on which a folder has the permissions of its
 /// parent.
 pub fn private_permissions() -> Option<Permissions> {
-    Some(Permissions::from_mode(PRIVATE))
+    Some(Permissions::from_mode(PRIVATE_MODE))
 }
 
 /// Makes the system write the content of the file `path` to the disk, and waits for it.

@@ -178,7 +178,7 @@ unsafe extern "system" fn handle_event(event: u32) -> BOOL {
     if let Some(end) = end {
         end(signal);
     }
-    // This line is reached if another event is already being handled; 1 tells the system that this event is handled,
-    // too.
+    // This line is reached only if another event is being handled already. The value 1 tells the system that this event
+    // needs no further handling.
     1
 }
