@@ -24,7 +24,8 @@ pub(super) type TilePlane = Aligned<[[f32; LANES]; GROUPS]>;
 /// One f32 for each sampled row, or each sampled column, of a tile.
 type TileLine = Aligned<[[f32; LANES]; SIDE / LANES]>;
 
-/// Pixels of one tile of a render. If only a grid of pixels is rendered, a tile has 16×16 pixels of the grid.
+/// Pixels of one tile that are rendered, at most 16×16. If only every n-th pixel along x and y is rendered
+/// ([`PixelGrid`]), a tile covers 16n×16n pixels of the image.
 pub(super) struct SampledPixels {
     /// Column in the image of the first pixel of the tile.
     x0: f64,
@@ -74,9 +75,9 @@ impl SampledPixels {
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance of each pixel of the tile before any splat is blended. It is 1 for pixels of the
-    /// render. Pixels of the tile outside the render get a negative value, which marks them as ended.
-    fn clear(&self) -> TilePlane {
+    /// Returns the transmittance of each pixel of the tile before any splat is blended: 1 for pixels of the render, and
+    /// −1 for pixels of the tile outside the render. The negative sign marks these pixels as ended.
+    fn initial_transmittance(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
         Aligned(std::array::from_fn(lanes))
@@ -127,13 +128,13 @@ pub(super) trait BlendSink {
     ///
     /// Matters only for vectors of a single group.
     const SPLITS_EVEN_ODD: bool = false;
-    /// Swaps the two sums of an accumulator that consists of one sum over the groups of pixels with even index and one
-    /// over the groups with odd index. With vectors of one group, [`BlendSink::add`] always adds to the first of the
-    /// two, so a swap directs the following groups to the other sum. Called twice per splat: after the groups with even
+    /// Swaps the two sums of an accumulator: the sum over the groups of pixels with even index, and the sum over the
+    /// groups with odd index. With vectors of one group, [`BlendSink::add`] always adds to the first of the two sums,
+    /// so a swap directs the following groups to the other sum. Called twice per splat: after the groups with even
     /// index, and after the groups with odd index.
     ///
-    /// The default implementation returns the accumulator unchanged, for receivers without two sums. A receiver with
-    /// two sums must return it unchanged, too, if a vector has several groups: such a vector adds to both sums at once.
+    /// Returns the accumulator unchanged in two cases: for receivers without two sums (the default implementation), and
+    /// for vectors of several groups, which add to both sums at once.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
@@ -381,7 +382,7 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
     // Combines the bits of the groups that share a vector into the bit of its first group.
     let vectors =
         |groups: u32| (0..V::GROUPS).fold(0, |all, k| all | groups >> k) & (u32::MAX / ((1 << V::GROUPS) - 1));
-    let mut transmittance = sampled.clear();
+    let mut transmittance = sampled.initial_transmittance();
     let mut live = vectors(sampled.groups());
     let mut alphas = TilePlane::default();
     let mut footprints = [TileFootprint::default(); LOOKAHEAD];
@@ -400,8 +401,8 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
             let groups = footprint.groups & live;
             let (falloff_x, opacity) = (V::splat(splat.falloff_x), V::splat(splat.opacity));
             let mut accumulator = sink.begin::<V>(splat);
-            // Computes first the alphas of all groups, which are independent and can overlap in the processor, and then
-            // the pixels, which depend on earlier splats.
+            // First computes the alphas of all groups. They do not depend on earlier splats, so the processor can
+            // compute several at the same time. Then blends the pixels, whose transmittance depends on earlier splats.
             let mut rest = groups;
             while rest != 0 {
                 let group = rest.trailing_zeros() as usize % GROUPS;

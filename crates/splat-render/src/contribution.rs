@@ -46,7 +46,8 @@ impl Contribution {
         self.sum[i] as f64 * Self::SUM_UNIT
     }
 
-    /// Adds `other`, the contributions of the same Gaussians in other views.
+    /// Adds to `self` the contributions in `other`, which come from other views of the same Gaussians. Sums are added;
+    /// of the two maxima of a Gaussian, the larger is kept.
     ///
     /// # Panics
     /// Panics if the numbers of Gaussians differ.
@@ -60,8 +61,8 @@ impl Contribution {
         }
     }
 
-    /// Adds the contribution of Gaussian `i` in one tile: the sum of its weights over the pixels, `sum`, and its
-    /// largest weight in a pixel, `max`.
+    /// Adds to the contribution of Gaussian `i` its contribution in one tile of a view: `sum` is the sum of its weights
+    /// over the pixels of the tile, and `max` its largest weight in one of them.
     pub(super) fn add(&mut self, i: usize, sum: f32, max: f32) {
         let units = (f64::from(sum) * (1.0 / Self::SUM_UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);

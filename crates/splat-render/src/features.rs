@@ -1,9 +1,10 @@
 //! Renders feature vectors of Gaussians: blends features in place of colors.
 //!
-//! Input: Gaussians at one frame, and features, each with a value of any sign per Gaussian. Output: blended features
-//! per pixel. Blending is linear, so three features at a time are rendered as colors. Features are shifted and scaled
-//! to 0 … 1, because colors are clamped at 0. The shift is undone with the opacity of each pixel, which is the render
-//! of a feature that is 1 everywhere.
+//! Input: Gaussians at one frame, and features; a feature has one value of any sign per Gaussian. Output: blended
+//! features per pixel. Blending is linear, so three features at a time are rendered as the three color channels. Colors
+//! are clamped at 0, so a feature f is rendered as (f − min) / span, which lies in 0 … 1. The blended feature of a
+//! pixel is then span · render + min · opacity, where the opacity of the pixel is the render of a feature that is 1
+//! everywhere.
 
 use super::render;
 use splat_core::{AttributeValues, Camera, Gaussians, sh_from_color};

@@ -43,8 +43,8 @@ impl PixelGrid {
         [0, 1].map(|axis| size[axis].saturating_sub(self.phase[axis]).div_ceil(self.stride))
     }
 
-    /// Returns the position in the image of a column or row of the grid, in pixels: of the column with the given
-    /// `index` if `axis` is 0, and of the row with this index if `axis` is 1.
+    /// Returns the column of the image that is column `index` of the grid (`axis` 0), or the row of the image that is
+    /// row `index` of the grid (`axis` 1).
     pub fn pixel(self, axis: usize, index: u32) -> u32 {
         self.phase[axis] + self.stride * index
     }

@@ -6,15 +6,14 @@
 //! [`Image`], or the [`Contribution`] or [`RemovalError`] of every Gaussian, or the
 //! [`Gradients`](splat_core::Gradients) of a loss.
 //!
-//! Memory: [`BYTES_PER_VISIBLE`] per visible Gaussian, and up to [`STRIP_BYTES`] for pairs of a Gaussian and a tile
-//! that it can change. Tiles are processed in strips whose pairs fit into these bytes. Only a single tile whose pairs
-//! do not fit takes more memory: 12 bytes per pair.
+//! Memory: [`BYTES_PER_VISIBLE`] per visible Gaussian, and up to [`STRIP_BYTES`] for (Gaussian, tile) pairs: a pair
+//! states that the Gaussian can change pixels of the tile. Tiles are processed in strips whose pairs fit into these
+//! bytes. Only a single tile whose pairs do not fit takes more memory: 12 bytes per pair.
 //!
 //! All conventions are those of the original CUDA rasterizer (Kerbl et al., "3D Gaussian Splatting", 2023), in every
-//! detail, because each deviation lowers the PSNR against its renders by tens of dB. Gaussians are skipped where their
-//! alpha is below 1/255, where that rasterizer does not draw them either. Pixels have the same bits for any number of
-//! threads and any instruction set. Gaussians with a NaN or infinite position, rotation, scale or opacity are not
-//! drawn.
+//! detail, because each deviation lowers the PSNR against its renders by tens of dB. For example, a Gaussian is skipped
+//! in the pixels in which its alpha is below 1/255. Pixels have the same bits for any number of threads and any
+//! instruction set. Gaussians with a NaN or infinite position, rotation, scale or opacity are not drawn.
 //!
 //! ```
 //! use splat_core::{Camera, Gaussians, sh_from_color};

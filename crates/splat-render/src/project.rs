@@ -17,8 +17,8 @@ use splat_core::exp_log::exp;
 
 /// Dilation: variance in pixels² that is added to the diagonal of every 2-D covariance, as in the original rasterizer.
 const DILATION: f64 = 0.3;
-/// Largest slope (x / depth or y / depth) at which the Jacobian of the projection is evaluated, as a multiple of the
-/// slope at the image edge. Gaussians further out use the Jacobian at this slope.
+/// Limit of the slopes x / depth and y / depth at which the Jacobian of the projection is evaluated, as a multiple of
+/// the slope at the image edge. For Gaussians with larger slopes, the Jacobian is evaluated at the limit.
 const FOV_MARGIN: f64 = 1.3;
 /// Limit of the absolute value of a log scale and of an opacity logit. Values are clamped, so that fourth powers of
 /// scales stay finite in f64.
@@ -197,8 +197,8 @@ pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTer
 /// Projects Gaussians like [`project`], in blocks of [`BLOCK`] Gaussians.
 #[inline(always)]
 fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
-    // Reserves the maximum at once, because growing would copy. Reserved memory that is never written takes no physical
-    // memory.
+    // Reserves memory for all Gaussians at once, because growing vectors would copy splats. Reserved memory that is
+    // never written takes no physical memory.
     out.splats.reserve_exact(ids.len());
     out.rects.reserve_exact(ids.len());
     let mut footprints = ProjectedSplats::default();
@@ -238,11 +238,11 @@ struct ProjectedSplats {
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
-    /// Half the width in pixels of the ellipse on which alpha is half its maximum. Half the width of the ellipse alpha
-    /// ≥ 1/255 is at most this number times the square root of [`Splat::cutoff`].
+    /// Half the width in pixels of the ellipse on which alpha is half its maximum. `half_u` · √[`Splat::cutoff`] is
+    /// half the width of the ellipse alpha ≥ 1/255, or slightly more.
     half_u: [f64; BLOCK],
-    /// Half the height in pixels of the ellipse on which alpha is half its maximum. Half the height of the ellipse
-    /// alpha ≥ 1/255 is at most this number times the square root of [`Splat::cutoff`].
+    /// Half the height in pixels of the ellipse on which alpha is half its maximum. `half_v` · √[`Splat::cutoff`] is
+    /// half the height of the ellipse alpha ≥ 1/255, or slightly more.
     half_v: [f64; BLOCK],
     /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
     radius: [f64; BLOCK],
@@ -327,7 +327,8 @@ impl ProjectedSplats {
         if rect.x0 >= rect.x1 || rect.y0 >= rect.y1 {
             return None;
         }
-        // Only a splat whose ellipse alpha ≥ 1/255 has a pixel beyond its tiles, inside the image, is cut off.
+        // A splat is cut off if its ellipse alpha ≥ 1/255 contains a pixel of the image outside the tiles of the
+        // original rasterizer.
         let is_cut = |at: f64, half: f64, (start, end): (u32, u32), tiles: u32| {
             let [start_pixel, end_pixel] = [start, end].map(|tile| f64::from(tile) * f64::from(TILE));
             (start > 0 && at - half <= start_pixel - 1.0) || (end < tiles && at + half >= end_pixel)

@@ -1,12 +1,14 @@
 //! Computes the error in a render that the removal of each single Gaussian would cause.
 //!
-//! In a pixel, a Gaussian of color c has the weight w = alpha · transmittance, and hides the color b of what is behind
-//! it. Without this Gaussian, the pixel changes by exactly w·(c − b). So a Gaussian of the same color as what is behind
-//! it can be removed without error, even if its weight is large.
+//! In a pixel, a Gaussian of color c has the weight w = alpha · transmittance and hides the color b behind it. Without
+//! this Gaussian, the pixel changes by exactly w·(c − b). A Gaussian with the same color as the background that it
+//! hides can thus be removed without error, even if its weight is large.
 //!
-//! If several Gaussians are removed at once, their changes add up, and b changes too. Therefore the square of a
-//! constant (the floor) is added to ‖c − b‖², and Gaussians are removed in several rounds, each with newly computed
-//! errors.
+//! These errors hold for the removal of a single Gaussian. If several Gaussians are removed at once, their changes add
+//! up, and b changes too: among several Gaussians of one color in front of each other, each alone may be removed almost
+//! without error, but not all of them. Two measures limit this effect. The square of a constant, the floor, is added to
+//! ‖c − b‖², so that a Gaussian with a large weight never has an error of 0. Gaussians are removed in several rounds,
+//! and the errors are computed again for each round.
 
 use serde::{Deserialize, Serialize};
 
@@ -27,8 +29,9 @@ pub struct RemovalError {
     /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed
     /// per 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
     pub sum: Vec<u64>,
-    /// Floor: color difference (norm over red, green and blue) that counts even between equal colors. Its square is
-    /// added to the squared difference between the color of a Gaussian and the color behind it.
+    /// Floor: constant whose square is added to ‖c − b‖², the squared difference (summed over red, green and blue)
+    /// between the color of a Gaussian and the color behind it. Between equal colors, the difference thus counts as the
+    /// floor.
     pub contrast_floor: f32,
 }
 
@@ -37,8 +40,8 @@ impl RemovalError {
     /// 320×256 pixels.
     pub const SUM_UNIT: f64 = 1.0 / (1u64 << 36) as f64;
 
-    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. The square of `contrast_floor`
-    /// is added to each squared color difference ([`RemovalError::contrast_floor`]).
+    /// Creates removal errors of 0 for `len` Gaussians, to which the errors in views are then added. The square of
+    /// `contrast_floor` is added to each squared color difference ([`RemovalError::contrast_floor`]).
     pub fn new(len: usize, contrast_floor: f32) -> Self {
         RemovalError { sum: vec![0; len], contrast_floor }
     }
@@ -98,8 +101,8 @@ pub(super) struct RemovalSink<'a> {
     /// the color behind these splats times the transmittance, computed as the color of the pixel minus weight · color
     /// of each of these splats.
     pub(super) behind: [TilePlane; 3],
-    /// Floor: color difference that counts even between equal colors. Its square is added to the squared difference
-    /// between the color of a splat and the color behind it ([`RemovalError::contrast_floor`]).
+    /// Floor: constant whose square is added to the squared difference between the color of a splat and the color
+    /// behind it ([`RemovalError::contrast_floor`]).
     pub(super) contrast_floor: f32,
     /// For each splat of the tile, the squared error that its removal would cause in the pixels of the tile: Σ w²·(‖c −
     /// b‖² + floor²), as in [`RemovalError`].
@@ -122,8 +125,8 @@ impl BlendSink for RemovalSink<'_> {
         fragment: Fragment<V>,
     ) -> ([V; 3], V::Sums) {
         let Fragment { weight, transmittance_after, .. } = fragment;
-        // What is behind this splat is drawn with `transmittance_after`; without the splat it would be drawn with
-        // `transmittance_after + weight`.
+        // Colors behind this splat are multiplied by `transmittance_after`. Without the splat, they would be multiplied
+        // by `transmittance_after + weight`.
         let gain = weight.div(transmittance_after);
         let floor = weight.mul(V::splat(self.contrast_floor));
         let mut squares = floor.mul(floor);

@@ -89,8 +89,7 @@ pub struct Renderer {
     pub(super) bins: Bins,
     weights: Vec<Weight>,
     pub(super) gradient_sums: ImageGradientSums,
-    /// Maximum number of (splat, tile) pairs in memory at a time. A single tile with more pairs is processed all the
-    /// same.
+    /// Maximum number of (splat, tile) pairs in memory at a time. Only a single tile with more pairs exceeds it.
     pub(super) strip_pairs: usize,
 }
 

@@ -91,7 +91,7 @@ impl Renderer {
         let add = |mut span: GradientSpan<'_>| {
             let [start, end] =
                 [span.ids().start, span.ids().end].map(|id| splats.partition_point(|splat| (splat.id as usize) < id));
-            splat::add(gaussians, &splats[start..end], &sums[start..end], &view, &mut span);
+            splat::add_gradients(gaussians, &splats[start..end], &sums[start..end], &view, &mut span);
         };
         if self.parallel {
             out.spans(SPAN).into_par_iter().for_each(add);

@@ -16,8 +16,8 @@ use super::sums::SplatSums;
 use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficients};
 
 /// Computes the gradients of the Gaussians whose projections are `splats`, and adds them to `out`, which must contain
-/// these Gaussians. `sums` holds for each splat the sums over its pixels from which the gradients follow.
-pub(super) fn add(
+/// these Gaussians. `sums` holds the gradient sums of each splat.
+pub(super) fn add_gradients(
     gaussians: &Gaussians,
     splats: &[Splat],
     sums: &[SplatSums<f64>],
@@ -64,8 +64,8 @@ pub(super) fn add(
     add_blocks(gaussians, splats, sums, view, out);
 }
 
-/// Does the same as [`add`], for [`BLOCK`] Gaussians at a time. Inlined, so that each instruction set has its own
-/// compiled version.
+/// Does the same as [`add_gradients`], for [`BLOCK`] Gaussians at a time. Inlined, so that each instruction set has its
+/// own compiled version.
 #[inline(always)]
 fn add_blocks(
     gaussians: &Gaussians,
@@ -89,7 +89,7 @@ fn add_blocks(
         if needs_direction || columns.contains(Attributes::SH) {
             let directions = Directions::new(gaussians, ids.clone(), view);
             if columns.contains(Attributes::SH) {
-                block.add_harmonics(gaussians, ids.clone(), &directions, out);
+                block.add_sh_gradients(gaussians, ids.clone(), &directions, out);
             }
             if needs_direction {
                 block.add_direction(gaussians, ids.clone(), &directions, out);
@@ -163,10 +163,10 @@ impl GradientBlock {
         }
     }
 
-    /// Adds to `out` the gradients of the SH coefficients: the value of the basis function Y_k times the gradient of
-    /// the color.
+    /// Adds to `out` the gradients of the SH coefficients: ∂L/∂c_k = Y_k · ∂L/∂color for the coefficient c_k of the SH
+    /// basis function Y_k.
     #[inline(always)]
-    fn add_harmonics(
+    fn add_sh_gradients(
         &self,
         gaussians: &Gaussians,
         ids: Range<usize>,
@@ -199,7 +199,7 @@ impl GradientBlock {
         out: &mut GradientSpan<'_>,
     ) {
         let n = ids.len().min(BLOCK);
-        // Gradient of each SH basis function Y_k: the gradient of the color times the SH coefficients.
+        // ∂L/∂Y_k for each SH basis function Y_k: the sum over color channels of the SH coefficient times ∂L/∂color.
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(color::coefficients(gaussians)).skip(1) {
             let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);

@@ -1,10 +1,12 @@
-//! Gradient sums: sums over pixels from which the gradients of splats are computed. There are sums over the pixels of
-//! one tile, and sums over the pixels of all tiles.
+//! Gradient sums: sums over pixels from which ∂L/∂attribute, the derivatives of a loss L with respect to the stored
+//! attributes of a Gaussian, are computed. There are sums over the pixels of one tile, and sums over the pixels of all
+//! tiles.
 
-/// Sums over pixels from which the gradients of one splat are computed: f32 sums over a tile in a fixed order, or f64
-/// sums over tiles.
+/// Gradient sums of one splat: the sums over pixels from which the derivatives of a loss L with respect to the
+/// attributes of its Gaussian are computed. `SplatSums<f32>` holds sums over the pixels of one tile, added in a fixed
+/// order, and `SplatSums<f64>` sums over the pixels of all tiles.
 ///
-/// In the fields, p = alpha · ∂L/∂alpha for a loss L, and (x, y) is the offset of a pixel: y from the center of the
+/// In the fields, p = alpha · ∂L/∂alpha, and (x, y) is the offset of a pixel, in pixels: y from the center of the
 /// splat, x from the position of the largest alpha in the row of the pixel.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SplatSums<T> {
@@ -31,12 +33,13 @@ impl SplatSums<f64> {
     }
 }
 
-/// Gradient sums ([`SplatSums`], sums over pixels) of all splats of a render.
+/// Gradient sums of all splats of a render, from which the derivatives of a loss of this render with respect to the
+/// attributes of all Gaussians are computed. See [`SplatSums`].
 #[derive(Debug, Default)]
 pub(in super::super) struct ImageGradientSums {
-    /// Gradient sums ([`SplatSums`]) of each splat over the pixels of all tiles.
+    /// For each splat, its gradient sums over the pixels of all tiles.
     pub(super) totals: Vec<SplatSums<f64>>,
-    /// Gradient sums ([`SplatSums`]) over the pixels of one tile, for each (splat, tile) pair of the tiles that are
-    /// processed now.
+    /// For each (splat, tile) pair of the tiles that are being processed, the gradient sums of the splat over the
+    /// pixels of the tile.
     pub(super) pairs: Vec<SplatSums<f32>>,
 }

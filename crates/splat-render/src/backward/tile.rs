@@ -1,5 +1,5 @@
-//! Backward pass over a tile: computes, from the gradients of pixels, the sums over pixels from which the gradients of
-//! splats follow.
+//! Backward pass over a tile: computes, from ∂L/∂pixel for a loss L, the gradient sums of each splat ([`SplatSums`]),
+//! from which the derivatives of L with respect to its Gaussian follow.
 //!
 //! The pass runs front to back again, so that no list of blended splats has to be kept. Each splat subtracts its weight
 //! times its color from the color of a pixel. The remaining color comes from behind the splat (docs/method.md, section

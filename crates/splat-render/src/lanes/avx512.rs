@@ -9,10 +9,10 @@ use super::{EvenOddSums, LANES, Lanes};
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx512(__m512);
 
-// SAFETY of every block below: the instructions need AVX-512 F and DQ (VL lets narrower ones use all registers).
-// `Avx512` is used only by `super::super::blend::BlendKernel::tile`, in a function entered after all of them were
-// detected (with AVX2, for `Avx2`). Loads and stores use the unaligned forms, on arrays of exactly two, eight or
-// sixteen f32. A prefetched address comes from a reference, and a prefetch reads nothing.
+// SAFETY of every block below: the instructions need AVX-512 F and DQ (VL lets instructions on narrower vectors use all
+// registers). `Avx512` is used only by `super::super::blend::BlendKernel::tile`, in a function entered after all of
+// them were detected (with AVX2, for `Avx2`). Loads and stores use the unaligned forms, on arrays of exactly two, eight
+// or sixteen f32. A prefetched address comes from a reference, and a prefetch reads nothing.
 macro_rules! avx512 {
     ($e:expr) => {
         // SAFETY: see the comment above the macro.

@@ -1,4 +1,5 @@
-//! Image metrics: PSNR, SSIM, FLIP, and the temporal error (of the differences between successive frames).
+//! Image metrics: PSNR, SSIM, FLIP, and the temporal error (flicker: the error of the differences between successive
+//! frames).
 //!
 //! Input: pairs of [`Image`]s of equal size. Output: one f64 per pair. Values are clamped to [0, 1] first, as on a
 //! screen, and all sums are in f64. Memory: [`BYTES_PER_PIXEL`] per pixel; FLIP takes what the code of its authors
@@ -50,8 +51,8 @@ pub fn decibels_text(psnr: f64, digits: usize) -> String {
 /// Computes the temporal error (flicker) between two sequences `a` and `b`: the root mean square of (a₁ − a₀) − (b₁ −
 /// b₀) over pixels and channels.
 ///
-/// Each argument holds the images 0 and 1 of one view at two successive frames. The result is in [0, 2], and 0 if both
-/// sequences change equally: an error that is constant over time does not count, flicker does.
+/// Each argument holds two renders of one view, at the successive frames 0 and 1. The result is in [0, 2], and 0 if
+/// both sequences change equally: an error that is constant over time does not count, flicker does.
 ///
 /// # Panics
 /// Panics if the sizes of the images differ.

@@ -36,7 +36,7 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     let mut total = 0.0;
     for channel in 0..3 {
         moments.set_windowed(a, b, channel);
-        total += (0..count).map(|i| Terms::new(moments.at(i)).similarity()).sum::<f64>();
+        total += (0..count).map(|i| SsimFactors::new(moments.at(i)).similarity()).sum::<f64>();
     }
     total / (3 * count) as f64
 }
@@ -45,7 +45,8 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
 /// 0 where clamping to [0, 1] changes the value.
 ///
 /// The SSIM of a pixel is S = (A₁A₂)/(B₁B₂), with factors computed from windowed sums. The derivative follows by the
-/// chain rule; applying the window is its own adjoint.
+/// chain rule. Because the window is symmetric, derivatives with respect to the windowed sums are weighted with the
+/// same window to get derivatives with respect to pixels.
 ///
 /// # Panics
 /// Panics if the sizes of the images differ.
@@ -56,7 +57,7 @@ pub fn ssim_gradient(a: &Image, b: &Image) -> Image {
         let mut moments = Moments::new(count);
         moments.set_windowed(a, b, channel);
         for i in 0..count {
-            let slopes = Terms::new(moments.at(i)).slopes();
+            let slopes = SsimFactors::new(moments.at(i)).slopes();
             // The sums are no longer needed and make room for the derivatives.
             moments.sums.iter_mut().zip(slopes).for_each(|(sum, slope)| sum[i] = slope);
         }
@@ -115,7 +116,7 @@ impl Moments {
 }
 
 /// Factors of the SSIM S = (A₁A₂)/(B₁B₂) at one pixel, and the means of both images around this pixel.
-struct Terms {
+struct SsimFactors {
     /// Means of the images a and b, weighted by the Gaussian window around the pixel.
     means: [f64; 2],
     /// Factors A₁ and A₂ of the numerator of the SSIM S = (A₁A₂)/(B₁B₂).
@@ -124,11 +125,11 @@ struct Terms {
     denominators: [f64; 2],
 }
 
-impl Terms {
+impl SsimFactors {
     /// Computes the factors A₁, A₂, B₁ and B₂ at a pixel from the windowed sums of a, b, a² + b² and a·b there.
-    fn new([a, b, squares, products]: [f64; 4]) -> Terms {
+    fn new([a, b, squares, products]: [f64; 4]) -> SsimFactors {
         let (squared_means, means_product) = (a * a + b * b, a * b);
-        Terms {
+        SsimFactors {
             means: [a, b],
             numerators: [2.0 * means_product + C1, 2.0 * (products - means_product) + C2],
             denominators: [squared_means + C1, squares - squared_means + C2],
@@ -137,14 +138,14 @@ impl Terms {
 
     /// Returns the SSIM of the pixel, S = (A₁A₂)/(B₁B₂).
     fn similarity(&self) -> f64 {
-        let Terms { numerators, denominators, .. } = self;
+        let SsimFactors { numerators, denominators, .. } = self;
         numerators[0] * numerators[1] / (denominators[0] * denominators[1])
     }
 
     /// Returns the derivatives of the SSIM S of the pixel with respect to the windowed sums of a, a² + b² and a·b, in
     /// this order. The fourth value is 0.
     fn slopes(&self) -> [f64; 4] {
-        let Terms { means: [a, b], numerators, denominators } = self;
+        let SsimFactors { means: [a, b], numerators, denominators } = self;
         let (whole, s) = (denominators[0] * denominators[1], self.similarity());
         let by_mean = 2.0 * b * (numerators[1] - numerators[0]) / whole
             - 2.0 * a * s * (1.0 / denominators[0] - 1.0 / denominators[1]);
