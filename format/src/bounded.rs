@@ -1,11 +1,11 @@
-//! Lossy tiles: encodes the values of a tile (one column for a block of Gaussians and frames) with an error of at most
-//! the column's bound, and decodes them (SPEC.md, "Bounded").
+//! Lossy tiles: encodes the values of a tile (one column for a block of Gaussians and frames) so that no decoded value
+//! differs from the original by more than the error bound of the column, and decodes them (SPEC.md, "Bounded").
 //!
 //! Values are stored as integer multiples of a step. A *track* is one component of one Gaussian over the frames of the
 //! tile. A track is *static* if one multiple is within the bound of all its values; this multiple is stored once. All
-//! other tracks are *moving*: their multiples are predicted from earlier frames, in integers, so that errors do not
-//! accumulate. The encoder decodes every value again. A value that is not finite, or would differ by more than the
-//! bound, is stored as an *exception* with its original bits.
+//! other tracks are *moving*: each multiple is predicted from the multiples of earlier frames, and the integer
+//! difference is stored, so that errors do not accumulate. The encoder decodes every value again. A value that is not
+//! finite, or would differ by more than the bound, is stored as an *exception* with its original bits.
 //!
 //! The table shows compression factors (raw bytes / stored bytes) of three trained models, with zstd level 15 and
 //! bounds of .001 for positions, .005 for rotations and .01 for log scales and SH coefficients (`cargo bench --bench
@@ -25,8 +25,8 @@ use std::io;
 
 use crate::codec::{TileStats, order_at, predict, shuffle_into, stats, zigzag};
 
-/// Range of the error bounds that a column may have. For each bound in it, the quantization step is a finite number
-/// above zero.
+/// Range of the error bounds that a column may have. Every bound in this range gives a finite quantization step above
+/// zero.
 pub(crate) const BOUNDS: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
 /// Length in bytes of the fields at the start of a stored tile: the quantization step, the number of exceptions (values
 /// stored with their original bits), and how often the step is halved for static tracks (components of a Gaussian that
@@ -54,8 +54,8 @@ pub(crate) struct BoundedTile {
 /// Encodes `values`, which are frames of `plane` values each, with an error of at most `max_error`. `level` is the zstd
 /// level.
 ///
-/// Returns `None` if this encoding does not pay: too many values have to be stored with their original bits, or the
-/// result takes 4 bytes per value or more.
+/// Returns `None` if the tile should be stored in another encoding: more than one value in 16 has to be stored with its
+/// original bits, or the result takes 4 bytes per value or more.
 pub(crate) fn encode(values: &[f32], plane: usize, max_error: f64, level: i32) -> io::Result<Option<BoundedTile>> {
     let step = step(values, max_error);
     let whole = Multiples::new(values, plane, max_error, step, 0);
@@ -94,13 +94,12 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step with which decoded values differ from `values` by at most `max_error`. The step is 2
-/// (`max_error` − r), where r is the largest error that rounding a decoded value to f32 may add. r follows from the
-/// largest absolute value in `values`.
+/// Returns the quantization step 2·(`max_error` − r), with which decoded values differ from `values` by at most
+/// `max_error`. r is the largest error that rounding a decoded value to f32 may add. It follows from the largest
+/// absolute value in `values`.
 ///
-/// Values so large that neighboring f32 numbers are more than half of `max_error` apart are ignored when this maximum
-/// is taken. If the error of such a value exceeds `max_error`, the value is stored with its original bits, as an
-/// exception.
+/// This maximum leaves out values so large that neighboring f32 numbers are more than `max_error` / 2 apart. If the
+/// error of such a value exceeds `max_error`, the value is stored with its original bits, as an exception.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -236,8 +235,8 @@ fn static_step(step: f64, halvings: u32) -> f64 {
 }
 
 /// Decoder of a lossy tile: turns the stored bytes of the tile into the quantized value of each track (component of a
-/// Gaussian), and quantized values into f32 values. Holds what it has read of the tile so far: the fields before the
-/// zstd frame ([`BoundedTracks::read_head`]), then the number of moving tracks ([`BoundedTracks::read_mask`]).
+/// Gaussian), and quantized values into f32 values. First call [`BoundedTracks::read_head`], which stores the fields
+/// before the zstd frame, then [`BoundedTracks::read_mask`], which stores the number of moving tracks.
 #[derive(Debug, Default)]
 pub(crate) struct BoundedTracks {
     /// Quantization steps: first of static tracks (components of a Gaussian whose values in all frames are stored as
@@ -345,8 +344,7 @@ impl BoundedTracks {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }
 
-    /// Returns the length in bytes of the mask with one bit per track (component of a Gaussian) that is set if the
-    /// track changes in the tile.
+    /// Returns the length in bytes of the mask, which has one bit per track (component of a Gaussian).
     fn mask_bytes(&self) -> usize {
         self.plane.div_ceil(8)
     }

@@ -1,5 +1,5 @@
-//! Memory-mapped files: reading by system calls or in place from the memory map, and what happens if a file changes
-//! meanwhile.
+//! Memory-mapped files: reading by system calls or in place from the memory map, also while another process changes the
+//! file.
 //!
 //! [`MappedFile::read_at`] reads by a system call and returns an error if the file was cut short.
 //! [`MappedFile::in_place`] returns a slice of the memory map. It first compares the range with the current length of

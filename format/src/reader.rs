@@ -343,12 +343,13 @@ impl Reader {
         }
     }
 
-    /// Estimates whether the whole file is in the page cache of the operating system, from `samples` evenly spaced
-    /// offsets; `None` if the operating system does not tell.
+    /// Estimates whether the whole file is in the page cache of the operating system: returns whether at least 90% of
+    /// `samples` evenly spaced offsets are. Returns `None` if the operating system does not tell.
     pub fn is_cached(&self, samples: u64) -> Option<bool> {
         let step = (self.file.len() / samples.max(1)).max(1);
         let mut places = (0..self.file.len()).step_by(step as usize).map(|offset| self.file.is_cached(offset));
-        // 90% of the offsets suffice: a few pages that must be read again cost less than another method of reading.
+        // 90% of the offsets suffice: reading a few pages from disk costs less than the method of reading for files
+        // that are not cached.
         let (mut cached, mut all) = (0, 0);
         places.try_for_each(|found| {
             cached += u64::from(found?);
@@ -396,7 +397,7 @@ impl Reader {
         Ok(self.tile_view(tile, &buffer.values))
     }
 
-    /// Returns the tile of the index entry `tile`, whose stored values are `values`.
+    /// Returns a view of the tile that has the index entry `tile` and the stored values `values`.
     fn tile_view<'a>(&self, tile: &TileRecord, values: &'a [f32]) -> Tile<'a> {
         Tile {
             values,

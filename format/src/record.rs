@@ -1,5 +1,5 @@
-//! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes, which contains a
-//! checksum of itself. The header may be followed by a payload (the stored bytes of the record), which has another
+//! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes, whose last 8 bytes are a
+//! checksum of the others. The header may be followed by a payload (the stored bytes of the record), which has another
 //! checksum.
 
 use std::fmt;
@@ -57,6 +57,7 @@ pub(crate) struct FooterRecord {
     pub(crate) header_checksum: u64,
 }
 
+/// Header of a record, of one of the three kinds that a container has.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Record {
     Tile(TileRecord),
@@ -225,8 +226,8 @@ impl TileRecord {
         Ok(())
     }
 
-    /// Returns whether the tile of another record, `other`, may share its stored bytes with the tile of this record.
-    /// Three conditions must hold:
+    /// Returns whether the tiles of this record and of `other` may use the same stored bytes. Three conditions must
+    /// hold:
     /// - Both tiles are constant (all frames equal).
     /// - They belong to the same column and Gaussian block.
     /// - All other fields of the records are equal, except for the frame block and the number of frames.

@@ -100,8 +100,9 @@ fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     }
 }
 
-/// Intact content that was found in a damaged file: the time stamps of each frame block, by its number, and the record
-/// (header) of each tile, by its position in the index.
+/// Intact content that was found in a damaged file. `times` holds the time stamps of each frame block by the number of
+/// the block, `tiles` the record (header) of each tile by its position in the index, and `skipped` is the number of
+/// bytes that belong to no intact record.
 struct FoundRecords {
     times: HashMap<u32, Vec<f64>>,
     tiles: HashMap<u64, TileRecord>,
@@ -114,8 +115,10 @@ struct FoundRecords {
 }
 
 /// Finds the intact records of `file` from offset `start` on, one after the other. After a damaged record, it tries
-/// every multiple of 64 bytes. A record contains its own offset, so bytes inside a payload are not mistaken for a
-/// record. Fails if a read fails, or if the records found need more than `memory` bytes of memory.
+/// every multiple of 64 bytes. Fails if a read fails, or if the records found need more than `memory` bytes of memory.
+///
+/// The record of a tile contains the offset of the stored bytes of the tile. Bytes inside a payload that look like such
+/// a record are therefore not mistaken for a tile, unless their offset is correct, too.
 fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<FoundRecords> {
     let mut found = FoundRecords {
         times: HashMap::new(),
@@ -160,7 +163,7 @@ fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<F
 }
 
 impl FoundRecords {
-    /// Returns the bytes of memory that recovery needs for what it has found so far: the lists of records with room for
+    /// Returns the bytes of memory that recovery needs for the records found so far: the lists of records with room for
     /// their growth, and buffers to decode the largest tile.
     fn bytes(&self, layout: &Layout) -> u64 {
         let tiles = (self.tiles.capacity() + self.constants.capacity()) * 3 / 2 * (size_of::<TileRecord>() + 16);

@@ -24,10 +24,13 @@ pub struct VerifyReport {
 }
 
 impl Reader {
-    /// Reads the whole file and checks all bytes that opening it did not check: every record equals its entry in the
-    /// index, the stored bytes of every tile have the recorded checksum and decode to values with the recorded
-    /// statistics, and all bytes in between are zero. Fails at the first difference. A change of any byte of the file
-    /// is found by opening or by this check.
+    /// Reads the whole file and checks all bytes that opening it did not check. Fails at the first difference.
+    /// Together, opening and this check find a change of any byte of the file. This check covers:
+    ///
+    /// - every record: it equals its entry in the index;
+    /// - the stored bytes of every tile: they have the recorded checksum and decode to values with the recorded
+    ///   statistics;
+    /// - all bytes in between: they are zero.
     ///
     /// Memory: one [`TileBuffer`], 1 byte per tile, about 20 bytes per constant tile (all frames equal).
     pub fn verify(&self) -> Result<VerifyReport> {
@@ -44,8 +47,8 @@ impl Reader {
         let mut buffer = TileBuffer::default();
         let mut seen = vec![false; self.index.tiles as usize];
         let mut blocks_seen = 0;
-        // Offsets of the stored bytes of constant tiles met so far. Opening has checked that tiles with the same stored
-        // bytes agree in all other fields of their records.
+        // Offsets of the stored bytes of constant tiles that were checked so far. Opening has checked that the records
+        // of tiles with the same stored bytes agree, except in frame block and number of frames.
         let mut own_payloads = HashSet::new();
         let (_, header) = crate::reader::read_header(&self.file)?;
         let mut position = self.skip_padding(header.len() as u64)?;

@@ -94,12 +94,11 @@ impl Writer {
         &self.layout
     }
 
-    /// Appends the next frame block and returns its number. `times` holds the time stamps of its frames:
-    /// [`Layout::frame_block`] of them, or fewer (at least one) in the last frame block, after which no other may
-    /// follow.
+    /// Appends the next frame block and returns its number. `times` holds the time stamps of the frames of this block.
+    /// Every block has [`Layout::frame_block`] frames; only the last one may have fewer, at least one.
     ///
-    /// Fails if a time stamp is not finite or not greater than the previous one, or if the last frame block was
-    /// appended before.
+    /// Fails if a time stamp is not finite or not greater than the previous one, if there are no or too many time
+    /// stamps, or if the previous frame block has fewer than [`Layout::frame_block`] frames.
     pub fn append_times(&mut self, times: &[f64]) -> Result<u32> {
         let most = self.layout.frame_block as usize;
         let first = self.times.len();
@@ -218,8 +217,8 @@ impl Writer {
     }
 
     /// Stores `record` at position `index` of the index (table of tiles), and counts its tile as written. The caller
-    /// has already appended the tile to the file, from offset `start` on. If this function fails, `start` is where the
-    /// file continues, so that the next tile overwrites the appended one.
+    /// has already appended the tile to the file, from offset `start` on. If this function fails, it sets the writing
+    /// position back to `start`, so that the next tile overwrites the appended one.
     fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
         let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
@@ -360,8 +359,8 @@ pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Re
     Ok(())
 }
 
-/// Creates a hidden file in the folder of `path`. Its name is that of `path` with the id of this process, and ends in
-/// `.tmp`. Returns the path of the hidden file, and the open file.
+/// Creates the hidden file `.NAME.PID-N.tmp` in the folder of `path`, with the file name of `path`, the id of this
+/// process, and a number that makes the name unique. Returns the path of the hidden file, and the open file.
 fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
