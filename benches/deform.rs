@@ -7,8 +7,8 @@
 //!
 //! The PyTorch times are for one core of the machine on which these benchmarks were first run. Two further cases are
 //! measured: positions alone (DyNeRF: and opacities), because the scan of a model reads nothing else, and the
-//! derivative of a frame state by positions, which refinement needs in every step. The time per Gaussian and frame is
-//! the inverse of the throughput that is printed.
+//! derivatives of the positions at a frame with respect to the stored positions, which refinement needs in every step.
+//! The time per Gaussian and frame is the inverse of the throughput that is printed.
 
 use std::path::Path;
 
@@ -85,7 +85,8 @@ fn deform(criterion: &mut Criterion) {
             });
         });
     }
-    // Derivative of states by positions: forward to the position head, and backward for each component.
+    // Derivatives of positions at a frame with respect to the stored positions: one forward pass through the position
+    // head, and one backward pass for each component.
     let mut raw = Gaussians::zeros(BLOCK, 3);
     raw.position = position;
     for (name, field) in

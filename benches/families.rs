@@ -4,7 +4,7 @@
 //! The benchmarks `network/*` measure only the network of Deformable-3D-Gaussians, for 1024 Gaussians:
 //! - `d3g`: the network with a time network; the encoded positions are computed once. It makes 0.5 million
 //!   multiplications per Gaussian.
-//! - `d3g_slopes`: the derivatives of the network's outputs by the positions.
+//! - `d3g_slopes`: the derivatives of the predicted motion of the positions with respect to the stored positions.
 //! - `bare_product`: for comparison, products of matrices of the same sizes by `matrixmultiply`, without biases, ReLUs
 //!   and sines.
 //!
@@ -13,7 +13,8 @@
 //!   covariance.
 //! - `sc_gs`: SC-GS with 64 copies of each Gaussian. All Gaussians share the network outputs for the control nodes,
 //!   which are computed for every time.
-//! - `spacetime` and `free_time`: SpacetimeGaussians and FreeTimeGS, which are polynomials and a temporal window.
+//! - `spacetime` and `free_time`: SpacetimeGaussians and FreeTimeGS, in which positions are polynomials of time and a
+//!   temporal window multiplies the opacity.
 //! - `native_4d`: native 4D Gaussians, which are slices of 4D covariances; `native_4d_colors`: with colors.
 //! - `native_4d_open`: the time of opening a block of native 4D Gaussians, which is needed once for all frames.
 //!
@@ -181,14 +182,14 @@ fn states(criterion: &mut Criterion<Processor>) {
     // More times than there are cached node outputs.
     let times: Vec<f64> = (0..1500).map(|frame| f64::from(frame) / 1499.0).collect();
     let scratch = tempfile::tempdir().expect("a folder for temporary files");
-    let still = Attributes::all().difference(Attributes::SH);
+    let all_but_sh = Attributes::all().difference(Attributes::SH);
     for (name, model, want) in [
-        ("d3g", "deformable3d", still),
-        ("d3g_6dof", "deformable3d_6dof", still),
-        ("sc_gs", "scgs", still),
+        ("d3g", "deformable3d", all_but_sh),
+        ("d3g_6dof", "deformable3d_6dof", all_but_sh),
+        ("sc_gs", "scgs", all_but_sh),
         ("spacetime", "stg_lite", Attributes::all()),
-        ("free_time", "ftgs", still),
-        ("native_4d", "yang4d", still),
+        ("free_time", "ftgs", all_but_sh),
+        ("native_4d", "yang4d", all_but_sh),
         ("native_4d_colors", "yang4d", Attributes::all()),
     ] {
         let model = folder.join("families").join(model);

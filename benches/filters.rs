@@ -50,8 +50,8 @@ impl Filter {
         format!("order{}_{layout}_zstd{}", self.order, self.level)
     }
 
-    /// Returns the f32 values `bits` (as their bits) filtered and compressed. The values are frame after frame; each
-    /// frame has `plane` values.
+    /// Filters and compresses f32 values, and returns the compressed bytes. `bits` holds the bits of the values, frame
+    /// after frame, with `plane` values per frame.
     fn encode(&self, bits: &[u32], plane: usize) -> Vec<u8> {
         let mut residuals = bits.to_vec();
         if self.order > 0 {
@@ -105,8 +105,8 @@ fn rank(bits: u32) -> u32 {
     bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// Returns the value predicted for a frame: the linear extrapolation of `one`, the value one frame before, and `two`,
-/// an earlier value. If both are equal, the prediction is this value.
+/// Returns the predicted value of a frame, 2·`one` − `two`, where `one` is the value one frame before. For prediction
+/// order 2, `two` is the value two frames before. For order 1, `two` equals `one`, so the prediction is `one`.
 fn predict(one: u32, two: u32) -> u32 {
     one.wrapping_mul(2).wrapping_sub(two)
 }
@@ -129,10 +129,13 @@ fn bound(column: Attributes) -> f64 {
     }
 }
 
-/// Returns the f32 values `bits` (as their bits, frame after frame, `plane` values each) encoded as multiples of twice
-/// `bound`, uncompressed. A track is one value of one Gaussian over time. The result has one bit per track, the first
-/// frame, then differences between frames. Bytes are grouped by significance. With `apart`, only tracks that move have
-/// differences; with `by_track`, differences are stored track by track instead of frame by frame.
+/// Encodes f32 values as multiples of twice `bound`, and returns the bytes before compression. `bits` holds the bits of
+/// the values, frame after frame, with `plane` values per frame. A track is one value of one Gaussian over time. The
+/// result has one bit per track, the multiples of the first frame, then differences between frames. Bytes are grouped
+/// by significance.
+///
+/// - `apart`: store differences only for tracks that move, instead of for all tracks.
+/// - `by_track`: store differences track by track, instead of frame by frame.
 fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool) -> Vec<u8> {
     let multiple = |&bits: &u32| (f64::from(f32::from_bits(bits)) / (2.0 * bound)).round() as i32;
     let values: Vec<i32> = bits.iter().map(multiple).collect();
@@ -159,8 +162,8 @@ fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool
 /// frame.
 type TileBits = (Vec<u32>, usize);
 
-/// Returns the row of the scene `name` and the attribute `column` in the table of encodings within an error bound.
-/// `tiles` holds the values.
+/// Returns a row of the table of encodings within an error bound: the row of the scene `name` and the attribute
+/// `column`, whose values are `tiles`.
 fn within_bounds(name: &str, column: Attributes, tiles: &[TileBits]) -> String {
     let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
     let times =

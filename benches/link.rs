@@ -1,5 +1,5 @@
-//! Measures how many Gaussians per second tracking links to the frame before and joins over gaps, on one thread and on
-//! two.
+//! Measures how many Gaussians per second tracking links to Gaussians of the frame before and joins over gaps, on one
+//! thread and on two.
 //!
 //! The cases differ in the frames, each of which has its Gaussians in another order:
 //! - `still` repeats every Gaussian to the bit.

@@ -10,8 +10,8 @@
 //!
 //! The other benchmarks measure the motion test and a complete pass:
 //! - `pairs`: time per pair and frame of measuring the motion of a pair, with positions in memory.
-//! - `measure`: the same with positions read from a compressed container. The pairs are measured at once or in eight
-//!   partitions. The difference is the cost of writing all trajectories to a scratch file and reading them again.
+//! - `measure`: the same with positions read from a compressed container. All pairs are measured at once, or in eight
+//!   partitions. Partitions take longer, because all trajectories are written to a scratch file and read again.
 //! - `merge`: time per survivor of one merging pass without motion: neighbors, tests, clusters, proxies.
 //!
 //! Usage: `cargo bench --bench merge`

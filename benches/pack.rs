@@ -1,16 +1,16 @@
 //! Measures how fast tiles of a container are encoded and decoded, per (Gaussian, frame), on one thread. A tile has the
 //! values of one attribute for some Gaussians at some frames.
 //!
-//! The inputs are generated curves and states of the trained models (skipped if they are missing), all varying
-//! attributes.
-//! - `encode/tile`: the codec alone. `encode/container`: all of packing, that is, states are gathered into tiles,
-//!   encoded, written and synced to disk.
+//! The inputs are generated curves and the trained models, which are skipped if they are missing. All attributes that
+//! vary with time are encoded.
+//! - `encode/tile`: only the encoding of tiles. `encode/container`: writing a whole container. Frame states are
+//!   gathered into tiles, encoded, written and synced to disk.
 //! - `decode/tile`: tiles are read from the page cache, verified and decoded. `decode/raw`: uncompressed tiles are
 //!   copied from the page cache.
-//! - `bounded`: encoding or decoding within an error of 0.001 in every attribute, at the zstd level that `pack` uses
-//!   for error bounds.
-//! - `plain_zstd`: for comparison, zstd at the same level on the same bytes without a filter. `memcpy`: copying of
-//!   these bytes.
+//! - `encode/bounded`, `decode/bounded`: lossy tiles with an error of at most 0.001 in every attribute, compressed at
+//!   zstd level 15, which `convert` uses for error bounds.
+//! - For comparison: `plain_zstd` compresses or decompresses the same values with zstd level 1, without a filter;
+//!   `memcpy` copies them.
 //!
 //! The stored sizes are printed before each scene.
 //!
@@ -30,8 +30,10 @@ use splatsieve::outputs::container::{GAUSSIAN_BLOCK, Packing, write_container};
 use splatsieve::passes::FramesInMemory;
 use splatsieve::source::FrameSource;
 
+/// zstd level of the lossless tiles and of `plain_zstd`.
 const LEVEL: i32 = 1;
-const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
+/// Compression of the lossy tiles.
+const BOUNDED: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 
 /// Returns every tile of the attributes that vary with time, as a pair: number of components per Gaussian, and values.
 /// A tile has the values of one attribute for some Gaussians at all frames.
@@ -49,8 +51,8 @@ fn write(scene: &FramesInMemory, path: &Path, packing: impl Into<Packing>) {
 
 fn decode_all(reader: &Reader, varying: Attributes, buffer: &mut TileBuffer) {
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
-        for (column, tiles_with_width) in Attributes::all().iter().enumerate() {
-            if varying.contains(tiles_with_width) {
+        for (column, attribute) in Attributes::all().iter().enumerate() {
+            if varying.contains(attribute) {
                 let at = TileId { column: column as u32, gaussian_block, frame_block: 0 };
                 black_box(reader.read_tile(at, buffer).unwrap().values());
             }
@@ -75,7 +77,7 @@ fn benches(criterion: &mut Criterion) {
         eprintln!(
             "{name}: tiles take {:.1}% of their raw bytes, within a bound {:.1}%, plain zstd {:.1}%",
             percent(tiles.iter().map(|tile| encode(tile).stored_bytes()).sum()),
-            percent(tiles.iter().map(|tile| encode_as(tile, WITHIN).stored_bytes()).sum()),
+            percent(tiles.iter().map(|tile| encode_as(tile, BOUNDED).stored_bytes()).sum()),
             percent(plain.iter().map(Vec::len).sum())
         );
         let path = folder.path().join("scene.gseq");
@@ -94,7 +96,7 @@ fn benches(criterion: &mut Criterion) {
             group.bench_function(BenchmarkId::new(rival, name), |bencher| bencher.iter(&mut *work));
         };
         group("encode", "tile", &mut || tiles.iter().for_each(|tile| _ = black_box(encode(tile))));
-        group("encode", "bounded", &mut || tiles.iter().for_each(|tile| _ = black_box(encode_as(tile, WITHIN))));
+        group("encode", "bounded", &mut || tiles.iter().for_each(|tile| _ = black_box(encode_as(tile, BOUNDED))));
         group("encode", "container", &mut || {
             one_thread.install(|| write(&scene, &folder.path().join("again.gseq"), Compression::Zstd(LEVEL)));
         });

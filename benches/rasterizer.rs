@@ -1,6 +1,7 @@
 //! Measures the time of a render, and of a render with its gradients: the derivatives of the squared error of the image
-//! by every attribute of every Gaussian. The inputs are 10,000 to a million synthetic Gaussians of SH degree 3, images
-//! of three sizes, and one thread or all threads. Prints CSV with the median, the smallest and the largest time.
+//! with respect to every attribute of every Gaussian. The inputs are 10,000 to a million synthetic Gaussians of SH
+//! degree 3, images of three sizes, and one thread or all threads. Prints CSV with the median, the smallest and the
+//! largest time.
 //!
 //! Each row also has, for comparison:
 //! - the number of blend events (pairs of a pixel and a Gaussian that changes it);

@@ -1,7 +1,7 @@
 //! Measures the cost of the scan, the pass that reads all frames of a container, per Gaussian and frame.
 //!
-//! The first benchmarks measure how much the scan takes beyond reading, on one thread. There are no views, so the scan
-//! consists of life span, motion and the search for NaN. Attributes vary in two ways: `position` alone, or
+//! The first benchmarks measure how much time the scan takes in addition to reading, on one thread. There are no views,
+//! so the scan consists of life span, motion and the search for NaN. Attributes vary in two ways: `position` alone, or
 //! `all_but_sh`; attributes that do not vary are read once.
 //! - `packed/scan`: scan of compressed tiles. It is compared with `packed/decode`, which only decodes the same tiles;
 //!   the goal is 80% of its speed. `packed/zstd` decompresses the same values, compressed without a filter at the same
@@ -175,7 +175,7 @@ struct Disk(Mutex<Instant>);
 impl Disk {
     /// Requests `bytes` bytes from the simulated disk, after all earlier requests. Returns the time at which the bytes
     /// are available.
-    fn order(&self, bytes: u64) -> Instant {
+    fn request(&self, bytes: u64) -> Instant {
         let mut busy = self.0.lock().unwrap();
         *busy = (*busy).max(Instant::now()) + Duration::from_secs_f64(bytes as f64 / SLOW);
         *busy
@@ -240,7 +240,7 @@ impl Prefetch for BenchSource<'_> {
 
     fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) {
         match &self.disk {
-            Some(disk) => wait_for(disk.order(self.bytes(gaussians, frames, want))),
+            Some(disk) => wait_for(disk.request(self.bytes(gaussians, frames, want))),
             None => self.container.fetch(gaussians, frames, want),
         }
     }
@@ -262,13 +262,14 @@ impl BlockReader for WaitingReader<'_> {
         if frame.is_multiple_of(block_frames)
             && let Some(disk) = &self.fed.disk
         {
-            let order = |start: usize, want| disk.order(self.fed.bytes(self.gaussians.clone(), start..start + 1, want));
+            let request =
+                |start: usize, want| disk.request(self.fed.bytes(self.gaussians.clone(), start..start + 1, want));
             let now = match self.coming {
                 Some((start, ready)) if start == frame => ready,
-                _ => order(frame, want),
+                _ => request(frame, want),
             };
             let next = frame + block_frames;
-            self.coming = (next < info.times.len()).then(|| (next, order(next, info.varying)));
+            self.coming = (next < info.times.len()).then(|| (next, request(next, info.varying)));
             wait_for(now);
         }
         self.reader.read(frame, want, out)

@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use splatsieve::model::Gaussians;
 
-/// Number of vector operations that blend one Gaussian into one vector of pixels, without loads and stores: 6 from
-/// position to exponent, 20 for the power of 2, 10 from there to weight and transmittance, 6 for the color.
+/// Number of vector operations that blend one Gaussian into one vector of pixels, without loads and stores: 6 for the
+/// exponent, 20 for the power of 2 with this exponent, 10 for weight and transmittance, 6 for the color.
 const OPERATIONS: f64 = 42.0;
 /// Number of pixels that the widest vector register holds.
 const LANES: f64 = 16.0;

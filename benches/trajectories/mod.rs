@@ -13,8 +13,10 @@ use splatsieve::source::{FrameSource, Ids};
 mod models;
 
 const GAUSSIANS: usize = 4096;
-/// Number of frames per tile (values that are encoded together) of a scene. The frames follow one another in time.
+/// Number of consecutive frames of a scene. Each tile (values of one attribute that are encoded together) has all of
+/// them.
 const FRAMES: usize = 32;
+/// Number of evenly spaced times in [0, 1) at which the trained models are read; the first [`FRAMES`] are used.
 const TIMES: usize = 60;
 
 /// Returns every input scene with its name: generated curves, and the trained models if they are available.
@@ -30,7 +32,8 @@ fn trained(folder: &Path, name: &str) -> FramesInMemory {
     let times = (0..TIMES).map(|t| t as f64 / TIMES as f64).collect();
     let model = ModelFolder::open(&folder.join(name), None).unwrap().with_times(times).unwrap();
     let info = model.info();
-    // Runs of 64 Gaussians keep the similarity of neighbors in the file.
+    // Takes runs of 64 consecutive Gaussians, so that neighbors in a tile are as similar as neighbors in the file of
+    // the model.
     let runs = GAUSSIANS / 64;
     let ids = (0..GAUSSIANS).map(|i| ((i / 64) * (info.count - 64) / runs + i % 64) as u32).collect::<Vec<_>>();
     let mut reader = model.open(Ids::List(&ids)).unwrap();
