@@ -79,8 +79,9 @@ fn memory_of_pairs_is_estimated_and_ignores_frame_count() {
     let (long, _) = peak(folder.path(), 256, 64);
     eprintln!("{pairs} pairs: {whole} bytes at once; in 64 partitions {short}, with four times the frames {long}");
     let together = pairs / 64 + 1;
-    // The results; order and place of every Gaussian and the gathered frames; one partition; the buffers of two
-    // threads.
+    // Estimated bytes, term by term: the cached results of all pairs; the order, the place and the gathered frames of
+    // every Gaussian; the pairs of one partition, with two Gaussians each. The buffers of the two threads are added
+    // below.
     let stated = BYTES_PER_CACHED_PAIR * pairs
         + (12 + 8 + 16 * FRAMES_HELD) * COUNT
         + (BYTES_PER_PAIR + 2 * bytes_per_gaussian(FRAMES_HELD)) * together;

@@ -12,7 +12,7 @@
 //! keys.
 //!
 //! A cell with a format is `COLUMN:FORMAT`, or `FILE/COLUMN[CONDITIONS]:FORMAT` for a value from another file. Its
-//! value is that of the first row of the file that fulfils the conditions and has the same key values, as far as the
+//! value is that of the first row of the file that fulfills the conditions and has the same key values, as far as the
 //! file has the key columns. It is a dash if there is no such row. Formats: `1` is one decimal, `,` an integer with
 //! commas, `%1` a percentage with one decimal, `=` the value as it is.
 //!
@@ -53,7 +53,7 @@ fn conditions(text: &str) -> Vec<(String, String)> {
     pairs.map(|pair| pair.split_once('=').expect("COLUMN=VALUE")).map(|(a, b)| (a.to_owned(), b.to_owned())).collect()
 }
 
-fn fulfils(row: &BTreeMap<String, String>, conditions: &[(String, String)]) -> bool {
+fn fulfills(row: &BTreeMap<String, String>, conditions: &[(String, String)]) -> bool {
     conditions.iter().all(|(column, value)| row.get(column) == Some(value))
 }
 
@@ -88,7 +88,7 @@ fn table_of(comment: &str) -> Vec<String> {
     let cells: Vec<&str> = cells.split(" | ").collect();
     let keys: Vec<&str> = cells.iter().copied().filter(|cell| !cell.contains(':')).collect();
     let mut combinations: Vec<Vec<(String, String)>> = Vec::new();
-    for row in rows(base).iter().filter(|row| fulfils(row, &conditions(filter))) {
+    for row in rows(base).iter().filter(|row| fulfills(row, &conditions(filter))) {
         let found = keys.iter().map(|key| ((*key).to_owned(), row[*key].clone())).collect();
         if !combinations.contains(&found) {
             combinations.push(found);
@@ -115,8 +115,8 @@ fn cell_of(cell: &str, base: &str, filter: &[(String, String)], key: &[(String, 
     let (file, column) = place.split_once('/').unwrap_or((base, place));
     let own = conditions(own);
     let fits = |row: &&BTreeMap<String, String>| {
-        fulfils(row, &own)
-            && (file != base || fulfils(row, filter))
+        fulfills(row, &own)
+            && (file != base || fulfills(row, filter))
             && key.iter().all(|(column, value)| row.get(column).is_none_or(|found| found == value))
     };
     let rows = rows(file);

@@ -1,5 +1,6 @@
-//! Tests of SH degree reduction: coefficients with no visible effect are removed, and the configuration names the lower
-//! degree, as far as a bound on renders allows. Coefficients stay if they matter or if an SH head adds to them.
+//! Tests of SH degree reduction. SH coefficients above a degree are removed if renders then stay within an error bound,
+//! and the configuration states the lower degree. Coefficients stay if renders need them, or if the deformation field
+//! has an SH head, which adds to them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -205,7 +206,7 @@ fn asked_degree_is_refined_to_its_best() {
     assert_eq!(configs[1], configs[0].replace("sh_degree=3", "sh_degree=0"));
     assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 17);
 
-    // As many Gaussians whose degree was lowered after refinement have a lower PSNR.
+    // A result with equally many Gaussians whose degree is lowered only after refinement has a lower PSNR.
     workplace.done(&format!("compress model --cameras {{tiny}} {how} --set bands=all -o whole"));
     workplace.done(
         "compress whole --cameras {tiny} --no-refine --prune-only --ratio 1 --set field=exact --set bands=0 -o late",
@@ -216,7 +217,8 @@ fn asked_degree_is_refined_to_its_best() {
         serde_json::from_str::<Value>(&looks).unwrap()["psnr"].as_f64().unwrap()
     };
     let [small, late] = ["small", "late"].map(psnr);
-    // The difference is small, because averaging the last steps helps a result that is cut down as well.
+    // The difference is small, because refinement averages the last steps, which also raises the PSNR of the result
+    // whose degree is lowered later.
     assert!(small > late + 0.1, "{small:.2} dB refined at degree 0, {late:.2} dB cut down to it");
 }
 

@@ -84,7 +84,7 @@ fn tracks_hold_every_row_of_unlinked_frames_to_the_bit() {
         let there = found.opacity_logit.plane(0).iter().filter(|&&logit| logit > -40.0).count();
         assert_eq!(there, order.len(), "those of frame {t} alone are seen");
     }
-    // Before and after its life a track keeps its state, so that it does not move.
+    // Before its first and after its last frame, a track keeps the state of that frame, so that it does not move.
     for (&i, &track) in &whose {
         let alive: Vec<usize> = (0..FRAMES).filter(|&t| is_alive(i, t)).collect();
         for t in [0, FRAMES - 1] {
@@ -126,7 +126,7 @@ fn frames_are_linked_if_rows_differ_or_on_request() {
         said.contains("frames have a common order: Gaussians of the same index are nearer than unrelated ones"),
         "{said}"
     );
-    // Cache entries of one way to open the frames are not used for the other.
+    // Cache entries of linked frames are not used for unlinked frames, and vice versa.
     let small = "compress mixed --ratio 0.5 --no-refine --cache work --link";
     workplace.done(&format!("{small} never -o never"));
     workplace.done(&format!("{small} always -o again"));
@@ -560,7 +560,7 @@ fn stream_of_unlinked_frames_gives_the_bytes_of_files() {
     let said = run("compress - -o small_stream.gseq --ratio 0.4 --no-refine --verbose");
     assert!(said.contains("linked frame stream") && said.contains("does not say which"), "{said}");
     assert!(same("small_files.gseq", "small_stream.gseq"));
-    // The same as frames of the Gaussians that are alive in them.
+    // The result written as PLY frames: each has only the Gaussians that are alive in it.
     run("compress - -o half --as ply-sequence --ratio 0.5 --no-refine");
     let rows = |t: usize| PlyRows::read(&workplace.path(&format!("half/frame_{t:05}.ply"))).rows.len();
     assert!((0..FRAMES).all(|t| (1..frames[t].len()).contains(&rows(t))));

@@ -386,7 +386,7 @@ fn later_passes_merge_groups_as_specified() {
 }
 
 #[test]
-fn every_merging_test_binds_as_specified() {
+fn every_stricter_merging_test_rejects_pairs_as_specified() {
     let base = || {
         let mut recipe = by_formula("default");
         recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];

@@ -88,7 +88,8 @@ fn exact_settings_have_no_error_and_others_converge() {
     }
 
     let percentiles = &curves(&found, "percentiles")[0];
-    // All views are used if there are so few: exact percentiles give what the finest view sampling gives.
+    // The scene has so few views that all are used. Exact percentiles therefore give the same PSNR as the finest
+    // sampling of views.
     let [exact, finest] = [percentiles, &curves(&found, "scoring")[0]]
         .map(|curve| &curve["marks"].as_array().unwrap().last().unwrap()["psnr"]);
     assert!(exact.is_number() && exact == finest, "{exact} {finest}");

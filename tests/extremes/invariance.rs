@@ -1,10 +1,11 @@
-//! Invariance properties (case 40 and the unit of time): statistics and selection do not depend on position,
-//! orientation, unit of length or unit of time of a scene. Scenes contain near-equal, subnormal, huge, missing and
-//! repeated values.
+//! Invariance properties (case 40 of the table in `main.rs`, and the unit of time): statistics and selection do not
+//! depend on position, orientation, unit of length or unit of time of a scene. Scenes contain near-equal, subnormal,
+//! huge, missing and repeated values.
 //!
 //! Half turns, powers of two and steps on a grid are exact in floats: the set of survivors and every bit of motion are
-//! the same. Operations that round (the logarithm of a scale, a unit of time that is no power of two) hold within the
-//! tolerance stated beside them, and the set of survivors except for Gaussians within that tolerance of the threshold.
+//! the same. Other changes round, such as a change of the logarithm of a scale, or a unit of time that is no power of
+//! two. Statistics then agree within the tolerance that the test states, and the survivors are the same, except for
+//! Gaussians whose score is within this tolerance of the threshold.
 
 use std::collections::BTreeMap;
 
@@ -206,7 +207,7 @@ proptest! {
         world in world(), power in 0i32..20, motion in motion(),
     ) {
         let by = 2f64.powi(power);
-        // Scales of points, because the logarithm of any other scale rounds.
+        // All Gaussians are as small as points, because changing the logarithm of any other scale would round.
         let points = world.map_states(|state, i| state.log_scale.set_row(i, [-90.0; 3]));
         let mut larger = points.map_states(|state, i| {
             let place = state.position.row::<3>(i);

@@ -40,7 +40,7 @@ fn the_demo_writes_pages_and_a_film_and_says_how_to_open_them() {
 
 #[test]
 #[ignore = "needs time"]
-fn the_demo_gives_the_same_bytes_for_any_number_of_threads() {
+fn demo_bytes_ignore_thread_count() {
     let at = Workplace::new();
     let of = |threads: u32| {
         at.done(&format!("{SMALL} -o d{threads} --threads {threads}"));

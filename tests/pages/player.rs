@@ -76,7 +76,7 @@ fn demo() -> (Workplace, PathBuf) {
 
 #[test]
 #[ignore = "needs a browser"]
-fn the_page_draws_as_the_rasterizer_and_asks_for_nothing() {
+fn page_draws_like_the_rasterizer_and_requests_no_url() {
     let program = browser::installed();
     let (at, whole) = demo();
     at.done("view d/scene.gseq d/compressed.gseq --cameras d/cameras.json -o scene --max-frames 30");
@@ -103,7 +103,7 @@ fn the_page_draws_as_the_rasterizer_and_asks_for_nothing() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn times_between_frames_are_interpolated_and_wipes_join_models() {
+fn times_are_interpolated_and_a_wipe_shows_both_models() {
     let program = browser::installed();
     let (_at, whole) = demo();
     let mut page = Browser::start_drawing(&program);
@@ -134,7 +134,7 @@ fn times_between_frames_are_interpolated_and_wipes_join_models() {
     let off = |a: &[u8], b: &[u8]| a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>();
     let [before, after] = [12, 13].map(|frame| shown(&format!("show=original&frame={frame}")).2);
     let end = page.value("Number(document.getElementById('scrub').max)").as_f64().unwrap();
-    // Its frames are evenly spaced.
+    // The frames of the test scene are evenly spaced.
     let middle = end * 12.5 / 29.0;
     go(&mut page, &format!("camera=1&paused&exact&show=original&time={middle}"));
     let between = pixels(&mut page).2;
@@ -145,7 +145,7 @@ fn times_between_frames_are_interpolated_and_wipes_join_models() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn it_plays_seeks_turns_and_jumps_and_names_are_text() {
+fn page_plays_seeks_turns_jumps_and_escapes_names() {
     let program = browser::installed();
     let (at, _) = demo();
     let odd = "<img src=x onerror=window.ran=1>\"'&.gseq";
@@ -173,7 +173,7 @@ fn it_plays_seeks_turns_and_jumps_and_names_are_text() {
     let value = |page: &mut Browser, id: &str| {
         page.value(&format!("Number(document.getElementById('{id}').value)")).as_f64().unwrap()
     };
-    // It plays from the start on, without being asked.
+    // The page begins to play by itself.
     let wait = "new Promise(done => setTimeout(done, 1500))";
     page.value(wait);
     let first = value(&mut page, "scrub");
@@ -200,14 +200,14 @@ fn it_plays_seeks_turns_and_jumps_and_names_are_text() {
     page.key(",", 188);
     page.value("splatsieve.settled()");
     assert!(pixels(&mut page) == at_seven, "back at the frame is another picture");
-    // A drag turns; the camera's number brings it back.
+    // A drag turns the camera; choosing the number of the camera restores it.
     page.drag(&[[500.0, 300.0], [560.0, 320.0], [600.0, 330.0]]);
     page.value("splatsieve.settled()");
     assert!(pixels(&mut page) != at_seven && value(&mut page, "camera") == 0.0);
     page.value("(s => { s.value = '0'; s.dispatchEvent(new Event('change')); })(document.getElementById('camera'))");
     page.value("splatsieve.settled()");
     assert!(pixels(&mut page) == at_seven, "the camera is not where it was");
-    // The handle of the wipe.
+    // Drags the handle of the wipe.
     go(&mut page, "show=wipe&camera=0&frame=7&paused&cut=0.5");
     let stage = page
         .value("(b => [b.left, b.top, b.width, b.height])(document.getElementById('stage').getBoundingClientRect())");
@@ -227,7 +227,7 @@ const CONTROLS: &str = "[...document.querySelectorAll('#controls button, #contro
 
 #[test]
 #[ignore = "needs a browser"]
-fn controls_are_even_named_and_fit_a_phone() {
+fn controls_have_equal_height_and_names_and_fit_a_phone() {
     let program = browser::installed();
     let (_at, whole) = demo();
     let mut page = Browser::start_drawing(&program);
@@ -244,7 +244,7 @@ fn controls_are_even_named_and_fit_a_phone() {
         let bar = page.value("document.getElementById('controls').offsetHeight").as_u64().unwrap();
         assert!(bar * 6 <= u64::from(height), "the controls take {bar} of {height} pixels");
     }
-    // Help lies over the page, and numbers in it are short.
+    // The help dialog opens over the page, and the numbers in its text are short.
     page.value("document.getElementById('canvas').focus()");
     page.key("?", 191);
     assert_eq!(page.value("document.getElementById('help').open"), json!(true));
@@ -255,7 +255,7 @@ fn controls_are_even_named_and_fit_a_phone() {
     assert_eq!(long, None, "{help}");
     page.value("document.getElementById('close').click()");
     assert_eq!(page.value("document.getElementById('help').open"), json!(false));
-    // A real press, as a script alone may not fill the screen.
+    // Presses the button with the mouse, because browsers allow full screen only after an action of the user.
     let button = "(b => [b.left + 20, b.top + 20])(document.getElementById('full').getBoundingClientRect())";
     let at: [f64; 2] = serde_json::from_value(page.value(button)).unwrap();
     page.drag(&[at]);
@@ -266,7 +266,7 @@ fn controls_are_even_named_and_fit_a_phone() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn a_poster_stands_until_drawing_and_embedding_hides_controls() {
+fn poster_stays_until_first_render_and_embed_hides_controls() {
     let program = browser::installed();
     let (at, whole) = demo();
     let text = fs::read_to_string(&whole).unwrap();
@@ -293,7 +293,7 @@ fn a_poster_stands_until_drawing_and_embedding_hides_controls() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn one_finger_turns_and_two_fingers_come_closer() {
+fn one_finger_turns_and_two_fingers_zoom() {
     let program = browser::installed();
     let (_at, whole) = demo();
     let mut page = Browser::start_drawing(&program);
@@ -317,7 +317,7 @@ fn one_finger_turns_and_two_fingers_come_closer() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn a_trained_model_looks_as_in_the_rasterizer() {
+fn trained_models_look_as_in_the_rasterizer() {
     let program = browser::installed();
     let Some(folder) = models::found() else { return };
     let at = Workplace::new();
@@ -352,7 +352,7 @@ fn a_trained_model_looks_as_in_the_rasterizer() {
 
 #[test]
 #[ignore = "needs time"]
-fn the_same_input_gives_the_same_page_for_any_number_of_threads() {
+fn page_bytes_ignore_thread_count() {
     let at = Workplace::new();
     at.done("test-scene -o d --gaussians 800 --frames 24");
     let pages = [1, 4].map(|threads| {
@@ -362,7 +362,8 @@ fn the_same_input_gives_the_same_page_for_any_number_of_threads() {
         fs::read(at.path(&format!("{threads}.html"))).unwrap()
     });
     assert!(pages[0] == pages[1]);
-    // 44 bytes of position, rotation, scale and opacity as f32, and 192 of harmonics at the first frame.
+    // Bytes of the values as f32, per Gaussian: 44 of position, rotation, scale and opacity at every frame, and 192 of
+    // SH coefficients at the first frame.
     let f32s = 800 * (24 * 44 + 192);
     assert!(pages[0].len() < f32s / 3, "{} bytes, of {f32s} as f32", pages[0].len());
 }
@@ -421,7 +422,7 @@ fn every_format_can_be_viewed_and_compress_writes_the_page() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn pages_of_hostile_names_break_no_policy_in_a_browser() {
+fn hostile_names_run_no_script_in_any_page() {
     let program = browser::installed();
     let at = Workplace::new();
     at.done("convert {tiny} frames --cameras {tiny} --as ply-sequence --frames 2");
@@ -441,7 +442,7 @@ fn pages_of_hostile_names_break_no_policy_in_a_browser() {
         }
         assert_eq!(page.value("typeof window.ran"), json!("undefined"), "{file}: a name ran");
         assert_eq!(complaints(&page, Some(&at.path("pages"))), Vec::<String>::new(), "{file}");
-        // Were a text not escaped, the policy would still keep it from running.
+        // If a text were not escaped, the content security policy would still keep its scripts from running.
         let text = fs::read_to_string(at.path(file)).unwrap();
         let broken = text.replace("</main>", "<script>window.ran=1</script><img src=x onerror=window.ran=2></main>");
         let beside = at.path(file).with_file_name("broken.html");

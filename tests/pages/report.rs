@@ -48,7 +48,7 @@ fn sweep() -> Value {
 }
 
 #[test]
-fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
+fn report_data_equal_those_of_evaluate_and_of_the_run() {
     let at = compressed();
     at.done("render d/scene.gseq --cameras d/cameras.json --all -o photographs");
     let rest = format!("{MODELS} --ground-truth photographs --max-frames 3");
@@ -80,7 +80,7 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
     assert!(note.contains("differ from those of the run"), "{note}");
     assert_eq!(read(&at.path("r/failure_modes.csv")).lines().count(), 4);
 
-    // Every histogram counts every Gaussian once, by what the index map says of it.
+    // Every histogram counts every Gaussian once: as kept, merged or dropped, in agreement with the index map.
     let map = crate::scene::index_map(&at.path("small.gseq.index_map.npy"));
     let dropped = map.iter().filter(|&&place| place == -1).count() as u64;
     for histogram in found["histograms"].as_array().unwrap() {
@@ -100,7 +100,7 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
 }
 
 #[test]
-fn the_page_is_well_formed_holds_all_it_needs_and_is_light() {
+fn report_page_is_well_formed_self_contained_and_small() {
     let at = compressed();
     fs::write(at.path("sweep.json"), sweep().to_string()).unwrap();
     at.done(&format!("report {MODELS} --sweep sweep.json -o r"));
@@ -143,7 +143,7 @@ fn overview(page: &str) -> &str {
 }
 
 #[test]
-fn the_overview_has_a_verdict_and_four_cards_without_symbols() {
+fn overview_has_verdict_and_four_cards_without_symbols() {
     let at = compressed();
     at.done("render d/scene.gseq --cameras d/cameras.json --all -o photographs");
     at.done(&format!("report {MODELS} --ground-truth photographs -o r"));
@@ -204,7 +204,7 @@ fn several_results_stand_side_by_side() {
 
 #[test]
 #[ignore = "needs time"]
-fn any_number_of_threads_gives_the_same_bytes() {
+fn report_bytes_ignore_thread_count() {
     let at = compressed();
     let of = |threads: u32| {
         at.done(&format!("report {MODELS} -o r{threads} --threads {threads}"));
@@ -261,7 +261,7 @@ fn balanced(page: &str) {
     let mut rest = page;
     while let Some(start) = rest.find('<') {
         let tag = &rest[start + 1..];
-        // A quoted attribute may hold what ends a tag; escaped text never does.
+        // A quoted attribute may contain `>`, which elsewhere ends a tag. Escaped text never contains it.
         let mut quote = false;
         let end = tag.find(|c: char| {
             quote ^= c == '"';
@@ -284,7 +284,7 @@ fn balanced(page: &str) {
 }
 
 #[test]
-fn a_page_that_is_not_well_formed_would_be_seen() {
+fn check_of_page_finds_unclosed_elements() {
     for page in ["<p><b></p></b>", "<p>", "<p", "</p>"] {
         let seen = std::panic::catch_unwind(|| balanced(page)).is_err();
         assert!(seen, "{page} passed");

@@ -27,7 +27,7 @@ fn reported() -> Workplace {
 
 #[test]
 #[ignore = "needs a browser"]
-fn the_page_asks_for_nothing_and_its_sliders_work() {
+fn report_requests_no_url_and_its_sliders_work() {
     let program = browser::installed();
     let at = reported();
     // A name that would run if it were not escaped.
@@ -60,7 +60,7 @@ fn the_page_asks_for_nothing_and_its_sliders_work() {
     let dragged = page.value(CUT).as_f64().unwrap();
     assert!((dragged - 20.0).abs() < 0.6, "dragged to 20%, the cut is at {dragged}%");
     assert_eq!(page.value("document.querySelector('.handle').offsetLeft > 0"), json!(true));
-    // It stops at the border, and stays when let go.
+    // The slider stops at the border of the image, and stays there when the mouse button is released.
     page.drag(&[point(0.2), point(1.0), [left + 1.2 * width, top + 5.0]]);
     assert_eq!(page.value(CUT).as_f64(), Some(100.0));
 
@@ -225,7 +225,7 @@ fn a_sweep_draws_every_chart_with_readable_text_and_no_request() {
 
 #[test]
 #[ignore = "needs a browser"]
-fn a_page_that_fails_or_asks_for_something_would_be_seen() {
+fn check_of_page_finds_requests_messages_and_exceptions() {
     let program = browser::installed();
     let at = Workplace::new();
     let bad = "<!doctype html><img src=\"http://127.0.0.1:9/x.png\"><script>console.log(1); nothing.there;</script>";

@@ -138,7 +138,8 @@ fn gradient_of_one_gaussian_is_its_closed_form() {
 
 #[test]
 fn image_moves_by_focal_length_over_depth() {
-    // The loss is the first moment of the image along u; its derivative by x is alphas · f/z.
+    // The loss is the first moment of the image along u. Its derivative with respect to the position x is Σ alpha times
+    // contrast and f/z.
     let (gaussians, camera) = (single_gaussian(2.0, 0.05, 0.6), plain_camera(48));
     let found = gradients(&gaussians, &camera, |picture| {
         let mut moment = plain_image(&camera, [0.0; 3]);
@@ -146,7 +147,8 @@ fn image_moves_by_focal_length_over_depth() {
         moment
     });
     let picture = render(&gaussians, &camera, [0.0; 3]);
-    // Integration by parts counts the values above the edge, where alpha drops from 1/255 to 0.
+    // Alpha drops from 1/255 to 0 at the edge of the splat. By integration by parts, the derivative is therefore Σ
+    // (alpha − 1/255) times contrast and f/z.
     let above = |red: f32| (f64::from(red) - 1.0 / 255.0).max(0.0);
     let red: f64 = picture.data.chunks_exact(3).map(|pixel| above(pixel[0])).sum();
     let expected = red * (1.0 - 0.1) * 50.0 / 2.0;

@@ -84,7 +84,7 @@ fn opaque_gaussian_is_cut_at_the_tiles_of_three_sigma() {
             got.in_pixels(0),
             expected.sum[0]
         );
-        // Extent without the rule, in pixels of the middle row of the image.
+        // Extent without the square of tiles, in pixels of the middle row of the image.
         let sigma = (25.0 * f64::from(0.15 + 0.001 * step as f32)).hypot(0.3f64.sqrt());
         let half = sigma * (2.0 * (255.0f64 * 0.95).ln()).sqrt();
         let drawn = render(&one, &camera, [0.0; 3]);
@@ -175,7 +175,7 @@ fn contributions_ignore_the_order_of_renders() {
 }
 
 #[test]
-fn ties_in_depth_fall_to_the_lower_index() {
+fn equally_deep_gaussians_are_drawn_in_index_order() {
     let mut two = Gaussians::zeros(2, 0);
     for i in 0..2 {
         two.position.set_row(i, [0.0, 0.0, 2.0]);
@@ -187,7 +187,7 @@ fn ties_in_depth_fall_to_the_lower_index() {
     assert!(red > 4.0 * green, "the first of two at one place is in front: red {red}, green {green}");
 }
 
-// Case 26 of EXTREMES.
+// Case 26 of the table in `tests/extremes/main.rs`.
 #[test]
 fn gaussians_nearer_than_0_2_or_behind_are_not_drawn() {
     for depth in [-3.0, -0.1, 0.0, 0.1999, 0.2] {
@@ -199,7 +199,7 @@ fn gaussians_nearer_than_0_2_or_behind_are_not_drawn() {
     assert!((pixel(&image, 0, 31)[0] - 0.95).abs() < 1e-4, "got {:?}", pixel(&image, 0, 31));
 }
 
-// Case 27 of EXTREMES.
+// Case 27 of the table in `tests/extremes/main.rs`.
 #[test]
 fn giant_across_the_near_plane_covers_just_the_image() {
     for log_scale in [7.0, 14.0, 80.0, 1e3, 3e38] {
@@ -214,7 +214,7 @@ fn giant_across_the_near_plane_covers_just_the_image() {
     }
 }
 
-// Case 29 of EXTREMES.
+// Case 29 of the table in `tests/extremes/main.rs`.
 #[test]
 fn occluded_gaussians_contribute_exactly_zero() {
     let mut stack = Gaussians::zeros(4, 0);
@@ -230,7 +230,7 @@ fn occluded_gaussians_contribute_exactly_zero() {
     assert_eq!((contribution.sum[3], contribution.max[3]), (0, 0.0));
 }
 
-// Case 30 of EXTREMES.
+// Case 30 of the table in `tests/extremes/main.rs`.
 #[test]
 fn giant_background_is_visible_around_the_foreground() {
     let mut both = Gaussians::zeros(2, 0);
