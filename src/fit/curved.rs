@@ -13,8 +13,9 @@
 //! spacing. The sum of such windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%.
 //!
 //! Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the optical depth of the
-//! Gaussian is distributed among the curves, by multiplicative updates that keep all depths positive (Richardson 1972,
-//! Lucy 1974). The factors of the updates are raised to the power 1.5, which needs a third fewer of them.
+//! Gaussian is distributed among the curves. This is done by iterations that multiply each curve's depth by a factor,
+//! so all depths stay positive (Richardson 1972, Lucy 1974). The factors are raised to the power 1.5, which saves a
+//! third of the iterations.
 
 use std::ops::Range;
 
@@ -53,7 +54,7 @@ impl CubicTrack {
 }
 
 /// Form of the curves that are fitted to a track (states of a Gaussian at all frames): degree of the motion, minimum
-/// width of the time windows, and maximum number of curves.
+/// width of the time windows, and maximum number of overlapping curves.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurveForm {
     /// Whether positions are linear and rotations are constant in time. If not, positions are cubic and rotations are
@@ -81,24 +82,25 @@ impl CurveForm {
         CurveForm { max_intervals, ..self }
     }
 
-    /// Returns the numbers n to try, in this order, for fits by n + 1 overlapping curves. The centers of their time
-    /// windows divide the visible time of the Gaussian into n intervals.
+    /// Returns the numbers n to try, in this order. For each n, a fit uses n + 1 overlapping curves; the centers of
+    /// their time windows divide the visible time of the Gaussian into n intervals.
     fn intervals(self) -> &'static [usize] {
         if self.has_linear_motion { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32] } else { &[2, 4, 8, 16, 32] }
     }
 }
 
-/// Width of an overlapping window, divided by the distance between the centers of neighboring windows.
+/// Width of the time window of an overlapping curve, divided by the distance between the centers of neighboring
+/// windows.
 const WIDTH_PER_INTERVAL: f64 = 0.75;
 /// Maximum number of iterations that distribute the optical depth −ln(1 − opacity) of a Gaussian among the curves that
 /// replace it ([`TrackFit::refine_depths`]).
 const MAX_UPDATES: usize = 60;
-/// Tolerance of the iterations in [`TrackFit::refine_depths`]. The iterations end once each curve meets one of two
-/// conditions:
+/// Tolerance of the iterations in [`TrackFit::refine_depths`], which change the optical depth of each curve. The
+/// iterations end once each curve meets one of two conditions:
 /// - The last iteration changed the curve's optical depth by less than this fraction.
 /// - The curve's optical depth before the last iteration was below this value, so the curve is nearly invisible.
 ///
-/// Depths start from this value or more.
+/// The iterations start from optical depths of at least this value, or 0 for a curve whose window covers no frame.
 const CONVERGED: f64 = 2e-3;
 /// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 const MAX_OPACITY: f64 = 0.999;
@@ -110,17 +112,17 @@ const RIDGE: f64 = 1e-6;
 ///   [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
 /// Number of iterations in [`TrackFit::refine_depths`] after which the error of overlapping curves is compared with
-/// [`HOPELESS`].
+/// [`MAX_FIRST_ERROR`].
 const FIRST_UPDATES: usize = 4;
-/// Multiple of the tolerance. Overlapping curves whose error is above it after [`FIRST_UPDATES`] iterations are skipped,
-/// because more iterations rarely reduce the error by this factor. Only if no curves meet the tolerance, the skipped
-/// ones are fitted with all iterations.
-const HOPELESS: f64 = 2.0;
+/// Largest error that overlapping curves may have after [`FIRST_UPDATES`] iterations, as a multiple of the tolerance.
+/// Curves with a larger error are skipped, because more iterations rarely reduce the error by this factor. Only if no
+/// curves meet the tolerance, the skipped ones are fitted with all iterations.
+const MAX_FIRST_ERROR: f64 = 2.0;
 
 /// Returns curves of the form `form` that represent `track`, the states of a Gaussian at all frames. Tries increasing
-/// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame. Numbers of curves whose
-/// error is far too large after a few iterations are skipped ([`HOPELESS`]). If no curves meet the tolerance, returns
-/// those with the smallest error. Adds the errors of the returned curves to `misfit`.
+/// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame. Numbers of curves
+/// whose error is far too large after a few iterations are skipped ([`MAX_FIRST_ERROR`]). If no curves meet the
+/// tolerance, returns those with the smallest error. Adds the errors of the returned curves to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,
@@ -151,7 +153,8 @@ pub fn fit_curves(
     curves.into_iter().filter(|curve| curve.opacity >= MIN_VISIBLE_OPACITY).collect()
 }
 
-/// Returns the optical depth of a Gaussian of opacity `opacity`.
+/// Returns the optical depth −ln(1 − α) of a Gaussian of opacity α = `opacity`, which is first limited to
+/// [`MAX_OPACITY`].
 fn depth(opacity: f64) -> f64 {
     -ln(1.0 - opacity.clamp(0.0, MAX_OPACITY))
 }
@@ -164,12 +167,12 @@ struct TrackFit<'a> {
     tolerance: &'a Tolerance,
     /// For each frame, whether the Gaussian is visible ([`FittedTrack::is_visible`]).
     visible: Vec<bool>,
-    /// For each frame, the optical depth of the Gaussian.
+    /// For each frame, the optical depth −ln(1 − opacity) of the Gaussian.
     depths: Vec<f64>,
     /// For each frame, the middle scale of the Gaussian ([`FittedTrack::middle_scale`]).
     middle_scales: Vec<f64>,
-    /// Frames that the fit of a motion uses, with their times since the center of the window and their weights. Kept to
-    /// reuse the memory.
+    /// Frames that the fit of a motion uses: frame, time since the center of the window, and weight. Kept to reuse the
+    /// memory.
     samples: Vec<(usize, f64, f64)>,
     /// Time windows of the curves of the current attempt, in their order.
     windows: Windows,
@@ -218,8 +221,8 @@ impl<'a> TrackFit<'a> {
         self.fit_motion(0)
     }
 
-    /// Tries one curve with an infinitely wide window. Its opacity is constant: the mean over the visible frames. Returns
-    /// whether the curve meets the tolerance.
+    /// Tries one curve with an infinitely wide window. Its opacity is constant: the mean over the visible frames.
+    /// Returns whether the curve meets the tolerance.
     fn try_constant_curve(&mut self) -> bool {
         let times = &self.track.times;
         let center = times[0].midpoint(times[times.len() - 1]);
@@ -229,9 +232,9 @@ impl<'a> TrackFit<'a> {
         self.keep_if_good(vec![CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }])
     }
 
-    /// Tries one curve. The logarithm of its opacity is a parabola in time, fitted to the visible frames with the squared
-    /// opacity as weight. The fit is exact if the opacity of the track is a time window, even if only a part of the
-    /// window lies within the sequence.
+    /// Tries one curve. The logarithm of its opacity is a parabola in time, fitted to the visible frames with the
+    /// squared opacity as weight. The fit is exact if the opacity of the track is a time window, even if only a part of
+    /// the window lies within the sequence.
     ///
     /// Returns whether the curve meets the tolerance. Returns `false` without trying a curve in these cases:
     /// - Fewer than three frames are visible.
@@ -299,7 +302,7 @@ impl<'a> TrackFit<'a> {
         if !self.seeks_best {
             self.refine_depths(&mut depths, FIRST_UPDATES);
             set_depths(&mut curves, &depths);
-            if self.measure_misfit(&curves, HOPELESS).is_none() {
+            if self.measure_misfit(&curves, MAX_FIRST_ERROR).is_none() {
                 return false;
             }
         }
@@ -308,9 +311,9 @@ impl<'a> TrackFit<'a> {
         self.keep_if_good(curves)
     }
 
-    /// Returns an estimate of the optical depth at the center of its window for each of `count` curves, whose windows
-    /// are in `self.windows`: the mean depth of the Gaussian under the window, divided by the sum of all windows at one
-    /// time.
+    /// Returns an estimate of the optical depth of each of `count` curves at the center of its window. The windows are
+    /// in `self.windows`. The estimate is the mean optical depth of the Gaussian under the window, divided by the sum
+    /// of all windows at one time.
     fn estimate_depths(&self, count: usize) -> Vec<f64> {
         // Evenly spaced windows add up to their integral divided by their distance.
         let overlap = WIDTH_PER_INTERVAL * std::f64::consts::PI.sqrt();
@@ -324,9 +327,9 @@ impl<'a> TrackFit<'a> {
         (0..count).map(estimate).collect()
     }
 
-    /// Changes `depths`, the optical depth at the center of its window for each curve, so that the depths of all curves
-    /// add up to the depth of the Gaussian at every frame. The windows are in `self.windows`. Ends after `max_updates`
-    /// iterations at the latest.
+    /// Changes `depths`, which holds for each curve the optical depth at the center of its window. Afterwards, the
+    /// depths of all curves add up to the depth of the Gaussian at every frame, as closely as the iterations reach. The
+    /// windows are in `self.windows`. Ends after `max_updates` iterations at the latest.
     fn refine_depths(&self, depths: &mut [f64], max_updates: usize) {
         // Frames that each window affects, with the values of the window there and the sum of these values.
         let shares: Vec<(Range<usize>, &[f64], f64)> = (0..depths.len())
@@ -365,8 +368,8 @@ impl<'a> TrackFit<'a> {
     }
 
     /// Returns a curve that follows the position and rotation of the track by least squares. Its time window is window
-    /// `k` of `self.windows`. The weight of a frame is the opacity of the Gaussian times the value of the window. Scales
-    /// and SH coefficients are weighted means. The opacity of the curve is 0; the caller sets it.
+    /// `k` of `self.windows`. The weight of a frame is the opacity of the Gaussian times the value of the window.
+    /// Scales and SH coefficients are weighted means. The opacity of the curve is 0; the caller sets it.
     fn fit_motion(&mut self, k: usize) -> CubicTrack {
         let track = self.track;
         let [center, width] = self.windows.shape(k);
@@ -413,9 +416,9 @@ impl<'a> TrackFit<'a> {
     /// Compares `curves`, whose time windows are in `self.windows`, with the track at all frames in which the Gaussian
     /// or a curve is visible. Returns two results, or `None` if the first is above `limit`:
     /// - The largest ratio of an error to its tolerance. It is at most 1 if the curves meet the tolerance. Errors that
-    ///   are NaN are ignored. The errors of a curve are multiplied by the fraction of the Gaussian's optical depth that
-    ///   the curve has at the frame. So a curve that is hardly visible at a frame need not be close to the Gaussian
-    ///   there.
+    ///   are NaN are ignored. All errors of a curve except that of the opacity are first multiplied by two factors:
+    ///   [`Tolerance::weight`], and the fraction of the Gaussian's optical depth that the curve has at the frame. So a
+    ///   curve that is hardly visible at a frame need not be close to the Gaussian there.
     /// - The errors over all these frames, in their own units.
     fn measure_misfit(&self, curves: &[CubicTrack], limit: f64) -> Option<(f64, FitError)> {
         let (track, tolerance) = (self.track, self.tolerance);
@@ -453,8 +456,9 @@ impl<'a> TrackFit<'a> {
         Some((worst, misfit))
     }
 
-    /// Returns the largest ratio of an error to its tolerance at `frame` over scales, SH coefficients and rotation of
-    /// `curve`. The error of the rotation is left out if it is certainly below `ignored` times its tolerance.
+    /// Returns the largest ratio of an error of `curve` at `frame` to its tolerance, over scales, SH coefficients and
+    /// rotation. Leaves out the rotation if its ratio is certainly below `ignored`, because its exact error is slow to
+    /// compute.
     fn excess_beyond_position(&self, frame: usize, curve: &CubicTrack, ignored: f64) -> f64 {
         let (track, tolerance) = (self.track, self.tolerance);
         let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);

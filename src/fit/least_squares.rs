@@ -1,10 +1,11 @@
 //! Weighted least squares fit of polynomials of low degree, in f64.
 
 /// Fits a polynomial Σ cₖ·uᵏ with `K` coefficients, at most 4, to each of the `C` components of `samples`. A sample is
-/// (u, y, w): argument, values of the components, and weight; u should be about within ±1. Returns the coefficients
-/// c₀ … that minimize Σ w·(y − Σ cₖ·uᵏ)² plus `ridge`·Σw·cₖ² for k ≥ 1. The ridge term, which is proportional to the
-/// total weight, keeps coefficients small that the samples do not determine. Returns zeros if the system cannot be
-/// solved.
+/// (u, y, w): argument, values of the components, and weight. Arguments u should lie about between −1 and 1.
+///
+/// Returns the coefficients c₀ … that minimize Σ w·(y − Σ cₖ·uᵏ)² + `ridge`·Σ w·(c₁² + c₂² + …). The ridge term keeps
+/// coefficients small that the samples do not determine. It is proportional to the total weight, so `ridge` does not
+/// depend on the unit of the weights. Returns zeros if the system cannot be solved.
 pub(crate) fn polynomial<const K: usize, const C: usize>(
     samples: impl Iterator<Item = (f64, [f64; C], f64)>,
     ridge: f64,

@@ -57,8 +57,9 @@ impl Default for Tolerance {
     }
 }
 
-/// Errors beyond which a fitted Gaussian counts as far off. First: error of its position, in units of its middle scale
-/// (the middle one of its three scales). Second: error of its opacity.
+/// Errors beyond which the fit counts as far off. First: distance between the positions of the fit and of the Gaussian,
+/// in units of the Gaussian's middle scale (the middle one of its three scales). Second: difference between their
+/// opacities.
 const FAR: [f64; 2] = [1.0, 0.1];
 
 /// Errors of fitted motions (curves, or pieces of linear motion) compared with the original states of the Gaussians.
@@ -75,7 +76,8 @@ pub struct FitError {
     opacity_squares: f64,
     /// Sum of the Gaussian's opacity over all compared states.
     visible: f64,
-    /// Sum of the Gaussian's opacity over the compared states in which the fit is off by more than [`FAR`].
+    /// Sum of the Gaussian's opacity over those compared states in which the fit is far off: one of its errors exceeds
+    /// [`FAR`].
     far: f64,
     /// Largest distance, over all compared states, between the positions of the fit and of the Gaussian, in units of
     /// the Gaussian's middle scale (the middle one of its three scales).

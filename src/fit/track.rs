@@ -84,8 +84,8 @@ impl FittedTrack {
         &self.sh[frame.min(self.sh.len() - 1)]
     }
 
-    /// Returns the mean of every SH coefficient. `mean` returns the mean over frames of a value that is given as a
-    /// function of the frame. It is not called if the coefficients are the same in all frames.
+    /// Returns the mean over frames of every SH coefficient. `mean(f)` returns the mean of the value f(frame); the
+    /// caller chooses the frames and their weights. It is not called if the coefficients are the same in all frames.
     pub fn mean_sh(&self, mean: impl Fn(&dyn Fn(usize) -> f64) -> f64) -> Vec<f32> {
         match self.sh.as_slice() {
             [constant] => constant.clone(),
@@ -123,8 +123,8 @@ impl FittedTrack {
         2.0 * self.half_angle_cosine(frame, rotation).acos()
     }
 
-    /// Returns an upper bound, in radians, of [`FittedTrack::rotation_error`]. It is faster to compute, from
-    /// acos x ≤ π/2·√(1 − x) for 0 ≤ x ≤ 1.
+    /// Returns an upper bound, in radians, of the angle that [`FittedTrack::rotation_error`] returns. The bound is
+    /// faster to compute. It follows from acos x ≤ π/2·√(1 − x) for 0 ≤ x ≤ 1.
     pub fn max_rotation_error(&self, frame: usize, rotation: [f64; 4]) -> f64 {
         // The factor 1 + 1e-9 covers rounding errors.
         std::f64::consts::PI * (1.0 - self.half_angle_cosine(frame, rotation)).sqrt() * (1.0 + 1e-9)

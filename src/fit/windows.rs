@@ -1,27 +1,30 @@
-//! Time windows exp(−((t − center)/width)²) of curves, with their values at the frames of a track.
+//! Time windows exp(−((t − center)/width)²) of fitted curves, with their values at the frames of a track. The opacity
+//! of a curve at the time t is its opacity at the center, multiplied by its window.
 
 use std::ops::Range;
 
 use crate::model::exp_log::exp;
 
-/// Distance in time from the center of a window, in widths of the window, from which on the window counts as 0. Its true
-/// value there is exp(−36).
+/// Value of |t − center| / width from which on a time window counts as 0 at the time t. Its true value there is
+/// exp(−36).
 const MAX_WIDTHS: f64 = 6.0;
 
-/// Returns the value at `time` of the window with the given center and width, which may be infinite.
+/// Returns the value at `time` of the time window exp(−((time − center)/width)²). The width may be infinite.
 pub(super) fn window(time: f64, center: f64, width: f64) -> f64 {
     let widths = (time - center) / width;
     if widths.abs() < MAX_WIDTHS { exp(-widths * widths) } else { 0.0 }
 }
 
-/// Several windows, with their values at the frames of one track.
+/// Time windows of several curves that are fitted to one track, with the values of each window at the frames of the
+/// track. A window is a factor on the opacity of its curve: exp(−((t − center)/width)²) at the time t.
 #[derive(Default)]
 pub(super) struct Windows {
-    /// For each window, its center and its width.
+    /// For each window, its center and its width, in units of time.
     shapes: Vec<[f64; 2]>,
-    /// For each window, the frames at which it is not 0, and the index in `values` of its value at the first of them.
+    /// For each window, the frames at which it is not 0, and the index in `values` of its value at the first of these
+    /// frames.
     frames: Vec<(Range<usize>, usize)>,
-    /// Values of all windows at these frames, one window after the other.
+    /// Values of all windows at the frames in `frames`, one window after the other.
     values: Vec<f64>,
 }
 
