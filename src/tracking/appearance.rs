@@ -8,9 +8,8 @@ use crate::model::{AttributeValues, Gaussians, SH_C0};
 /// Largest magnitude of the natural log of a scale. Larger ones are clamped to this value, so that squares of scales
 /// stay finite in f32.
 const MAX_LOG_SCALE: f32 = 30.0;
-/// Units in which two Gaussians are compared: a difference of one unit in size, shape, opacity or color adds 1 to the
-/// cost of linking them (linking needs a cost of at most 1). The difference in size is the natural log of the ratio of
-/// the sizes.
+/// Difference in size that adds 1 to the difference in appearance A of two Gaussians, as the natural log of the ratio
+/// of their sizes. A is the sum of (difference / unit)² over size, shape, opacity and color; the other units follow.
 const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
 const SHAPE_UNIT: f32 = 0.25;
 const OPACITY_UNIT: f32 = 0.5;
@@ -81,23 +80,23 @@ impl ComparedAppearance {
         self.color.iter().sum()
     }
 
-    /// Returns the difference in appearance A between this Gaussian and `other`: the sum of the squared differences in
-    /// size, shape, opacity and color, each divided by the difference that adds 1 to A ([`SIZE_UNIT`], [`SHAPE_UNIT`],
-    /// [`OPACITY_UNIT`], [`COLOR_UNIT`]). A is symmetric.
+    /// Returns the difference in appearance A between this Gaussian and `other`: the sum of (difference / unit)² over
+    /// size, shape, opacity and color, with the units [`SIZE_UNIT`], [`SHAPE_UNIT`], [`OPACITY_UNIT`] and
+    /// [`COLOR_UNIT`]. The difference in size is the natural log of the ratio of the sizes. A is symmetric.
     pub(super) fn difference(&self, other: &ComparedAppearance) -> f32 {
         let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
         self.difference_without_opacity(other) + opacity * opacity
     }
 
     /// Returns whether this Gaussian and `other` are near-duplicates: their distance is at most a quarter of the
-    /// smaller size, and they differ little in size, shape and color. Opacity does not count.
+    /// smaller size, and they differ little in size, shape and color. Opacity is not compared.
     pub(super) fn is_near_duplicate(&self, other: &ComparedAppearance) -> bool {
         self.distance_cost(other, DUPLICATE_REACH, DUPLICATE_STRICTNESS) <= 1.0
     }
 
-    /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A between Gaussians a (this one) and b (`other`):
-    /// positions x, sizes s, difference A in size, shape and color. `reach` is r, `strictness` is q. If the distance
-    /// term alone exceeds 1, returns only this term.
+    /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A of joining Gaussian a (this one) and Gaussian b
+    /// (`other`). x are positions, s sizes, and A is the difference in size, shape and color. `reach` is r,
+    /// `strictness` is q. If the first term alone exceeds 1, returns only this term.
     pub(super) fn distance_cost(&self, other: &ComparedAppearance, reach: f32, strictness: f32) -> f32 {
         let unit = reach * self.size.min(other.size);
         let distance = squared_distance(&self.position, &other.position) / (unit * unit);
@@ -105,9 +104,8 @@ impl ComparedAppearance {
         if distance > 1.0 { distance } else { distance + strictness * self.difference_without_opacity(other) }
     }
 
-    /// Returns the difference in appearance between this Gaussian and `other` without opacity: the sum of the squared
-    /// differences in size, shape and color, each divided by the difference that adds 1 to the sum ([`SIZE_UNIT`],
-    /// [`SHAPE_UNIT`], [`COLOR_UNIT`]).
+    /// Returns the difference in appearance without opacity between this Gaussian and `other`: the sum of (difference /
+    /// unit)² over size, shape and color, with the units [`SIZE_UNIT`], [`SHAPE_UNIT`] and [`COLOR_UNIT`].
     fn difference_without_opacity(&self, other: &ComparedAppearance) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size
@@ -120,8 +118,8 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
 }
 
-/// Hashes `x` by two rounds of an exclusive or with its upper half (a shift by 32 bits) and a multiplication by an odd
-/// constant, modulo 2⁶⁴. Both steps are bijections, so different numbers have different hashes.
+/// Returns a hash of `x`. Two times, `x` is combined with its upper half by exclusive or (a shift by 32 bits) and
+/// multiplied by an odd constant modulo 2⁶⁴. Both steps are bijections, so different numbers have different hashes.
 pub(super) fn mix(x: u64) -> u64 {
     let x = (x ^ (x >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93);
     (x ^ (x >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93)

@@ -9,7 +9,7 @@ use super::track::{Candidates, NONE, OpenTrack, Round};
 /// certain links are removed.
 pub(super) const MAX_WRONG: f64 = 0.005;
 /// Cost that is added to the numerator and to the denominator of each ratio of link costs (distance and difference in
-/// appearance of linked Gaussians). As a result, two costs that differ by less than this count as equal.
+/// appearance of linked Gaussians). Costs far below this value thus count as equal, and 0/0 cannot arise.
 const COST_TOLERANCE: f32 = 1e-6;
 /// Assumed probability that the Gaussian of a track (Gaussian followed through frames) is absent from a frame, although
 /// an unrelated one lies within reach.
@@ -41,7 +41,7 @@ impl LinkConfidence {
     ///
     /// - `candidates_by_track`: for each track that took part in the round, the Gaussians that might have continued it.
     /// - `tracks` and `appearances`: all open tracks, and the appearances of all Gaussians of the frame.
-    /// - `round`: parameters of the round, from which the costs of links follow.
+    /// - `round`: parameters of the round, which determine the costs of links.
     pub(super) fn add_round(
         &mut self,
         links: &Links,

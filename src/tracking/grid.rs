@@ -68,11 +68,12 @@ impl CellGrid {
         CellGrid { reach, mask, starts, cells, entries }
     }
 
-    /// Calls `visit` with the number and the appearance of every Gaussian in the grid cells where similar Gaussians may
-    /// lie. These cells contain all Gaussians that satisfy two conditions, and also others:
+    /// Searches for Gaussians of about the size of `appearance` near `center`. Calls `visit` with the number and the
+    /// appearance of each Gaussian found. Finds every Gaussian that satisfies two conditions, and others in the same
+    /// grid cells:
     ///
-    /// - The size is that of `appearance` within a factor of √2.
-    /// - The position differs from `center` by at most `radius` (scene units) along each axis.
+    /// - Its size differs from that of `appearance` by a factor of at most √2.
+    /// - Its position differs from `center` by at most `radius` (scene units) along each axis.
     ///
     /// In a cell with more than 64 Gaussians, only the 64 with the brightness nearest to that of `appearance` are
     /// visited.
@@ -129,7 +130,7 @@ impl CellGrid {
     }
 }
 
-/// Returns the octaves that contain all sizes within a factor of √2 of the size with the natural log `ln_size`. Octave
+/// Returns the octaves that contain all sizes within a factor of √2 of the size whose natural log is `ln_size`. Octave
 /// k has the sizes from 2ᵏ to 2ᵏ⁺¹ scene units.
 fn levels(ln_size: f32) -> RangeInclusive<i64> {
     let octave = f64::from(ln_size) / std::f64::consts::LN_2;
@@ -139,8 +140,8 @@ fn levels(ln_size: f32) -> RangeInclusive<i64> {
 /// Returns the width of the grid cells for octave `level`, in scene units. This octave contains the Gaussians of the
 /// sizes from 2^level to 2^(level + 1) scene units.
 ///
-/// A search has a radius of `reach` times the size of a Gaussian. Cells are as wide as the diameter of the search for
-/// the largest Gaussian of the octave.
+/// A search for neighbors of a Gaussian has the radius `reach` · size. The cells are as wide as twice the radius of the
+/// search for the largest Gaussian of the octave.
 fn side(level: i64, reach: f64) -> f64 {
     2.0 * reach * ((level + 1) as f64).exp2()
 }
@@ -162,9 +163,9 @@ fn floor(x: f64) -> i64 {
     toward_zero - i64::from(x < toward_zero as f64)
 }
 
-/// Hash of a grid cell, computed from its octave of sizes and its index along each axis. Two cells with equal hashes
-/// cost time but change no result. The eight cells of a cube of 2×2×2 cells have hashes that differ in the last three
-/// bits only, so they are adjacent in the hash table.
+/// Key of a grid cell, from which its hash is computed: its octave of sizes, and its index along each axis. Two cells
+/// with equal hashes cost time but change no result. The eight cells of a cube of 2×2×2 cells have hashes that differ
+/// in the last three bits only, so they are adjacent in the hash table.
 #[derive(Clone, Copy)]
 struct CellKey {
     cube: u64,

@@ -7,8 +7,8 @@ use crate::model::Gaussians;
 /// Maximum number of indices at which the Gaussians of two frames are compared; they are evenly spread over all
 /// indices.
 const MAX_COMPARED: usize = 4096;
-/// Threshold of the test whether two frames have the same order of Gaussians: the maximum median difference between
-/// Gaussians at the same index, as a fraction of the median difference between unrelated Gaussians.
+/// Threshold of the test whether two frames have the same order of Gaussians. The median difference between Gaussians
+/// at the same index may be at most this fraction of the median difference between unrelated Gaussians.
 const MAX_PART_OF_UNRELATED: f64 = 0.5;
 /// Number of Gaussians from which on two frames are tested for the same order of Gaussians. Without a test, frames with
 /// fewer Gaussians count as being in the same order.
@@ -27,8 +27,8 @@ pub struct OrderDifference {
     /// Median distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the
     /// second), in units of the smaller Gaussian's size.
     pub unrelated_position_difference: f64,
-    /// Median difference in appearance between Gaussians at the same index: sum of the squared differences in size,
-    /// shape, opacity and base color, each divided by the difference that adds 1 to the cost of a link.
+    /// Median difference in appearance between Gaussians at the same index: the sum of (difference / unit)² over size,
+    /// shape, opacity and base color. The units are those in which the costs of links are measured.
     pub appearance_difference: f64,
     /// Median difference in appearance, in the unit of `appearance_difference`, between unrelated Gaussians (index i of
     /// the first frame and i + N/2 of the second).
@@ -41,8 +41,9 @@ pub struct OrderDifference {
     pub is_common: bool,
 }
 
-/// Tests whether two frames with equally many Gaussians have the same order of Gaussians. Compares the Gaussians of
-/// `before` and `after` at the same index, at up to 4096 indices.
+/// Tests whether two frames of N Gaussians each have the same order of Gaussians. Compares the Gaussians of `before`
+/// and `after` at the same index, at up to 4096 indices. For comparison, also measures the differences between
+/// Gaussians whose indices are N/2 apart, which are unrelated.
 ///
 /// The order always counts as the same if there are fewer than 16 Gaussians, or if Gaussians at the same index differ
 /// by no more than rounding.

@@ -20,11 +20,11 @@ const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, includes_missing: true
 /// logarithm: ln √2. The size is the root mean square of the three scales. The maximum is √2, because the search for
 /// similar Gaussians ([`CellGrid::for_each_near`]) is only certain to find sizes up to this ratio.
 const MAX_LN_SIZE_RATIO: f32 = std::f32::consts::LN_2 / 2.0;
-/// Largest count of shared frames with which two tracks (Gaussians followed through frames) may still be joined. A
-/// frame in which both tracks are present raises the count by 1; a frame in which one of them is missing lowers it by
-/// 1, down to 0. Some shared frames are allowed because a Gaussian may fade out as one track while it fades in as the
+/// Largest overlap score with which two tracks (Gaussians followed through frames) may still be joined. The score of a
+/// pair rises by 1 in each frame in which both tracks are present. It falls by 1, down to 0, in each frame in which one
+/// of them is missing. Some overlap is allowed because a Gaussian may fade out as one track while it fades in as the
 /// other.
-const MAX_SHARED_FRAMES: u8 = 4;
+const MAX_OVERLAP_SCORE: u8 = 4;
 
 /// Rules by which tracks (Gaussians followed through frames) are joined. Tracks that satisfy the second rule also
 /// satisfy the first.
@@ -53,9 +53,9 @@ struct TrackPair {
     track: u32,
     earlier: u32,
     cost: f32,
-    /// Count of shared frames, see [`MAX_SHARED_FRAMES`]: each frame in which both tracks are present raises it by 1,
-    /// and each frame in which one of them is missing lowers it by 1, down to 0.
-    shared_frames: u8,
+    /// Overlap score: each frame in which both tracks are present raises it by 1, and each frame in which one of them
+    /// is missing lowers it by 1, down to 0. At most [`MAX_OVERLAP_SCORE`].
+    overlap_score: u8,
     /// Whether the two tracks looked the same (rule `CLOSE`) in every frame in which both were present.
     are_close: bool,
     /// Whether the earlier track has ended, so that the later track can be joined to it.
@@ -133,9 +133,9 @@ impl Joiner {
                 joined.pairs.extend(candidates.iter().filter_map(|candidate| {
                     let earlier = &old[candidate.gaussian as usize];
                     let are_close = cost(&appearances[candidate.gaussian as usize], &track.appearance, &CLOSE) <= 1.0;
-                    let shared_frames = u8::from(earlier.frames_since_seen == 1);
+                    let overlap_score = u8::from(earlier.frames_since_seen == 1);
                     let (track, earlier, cost) = (track.number, earlier.number, candidate.cost);
-                    let pair = TrackPair { track, earlier, cost, shared_frames, are_close, has_ended: false };
+                    let pair = TrackPair { track, earlier, cost, overlap_score, are_close, has_ended: false };
                     (are_close || !is_in_doubt).then_some(pair)
                 }));
             }
@@ -144,9 +144,9 @@ impl Joiner {
 
     /// Ends the joining of tracks (Gaussians followed through frames). To be called after the last frame, with the
     /// linker that has linked it. Returns the result of joining by the rule `ALIKE` (tracks that may be one Gaussian),
-    /// then the result by the stricter rule `CLOSE` (tracks that look the same). Each result is a pair of
+    /// then the result by the stricter rule `CLOSE` (tracks that look the same). Each result is a pair:
     ///
-    /// - a list with the number of the joined track of every track, in the order in which the tracks began;
+    /// - for each track, in the order in which the tracks began, the number of the joined track to which it belongs;
     /// - the number of joined tracks.
     pub fn finish(self, linker: &Linker) -> [(Vec<u32>, usize); 2] {
         self.0.map(|joined| joined.finish(linker))
@@ -160,9 +160,9 @@ impl JoinedTracks {
     /// - The earlier track has ended: the pair is marked as ready to be joined.
     /// - The later track has ended first: the two tracks are joined if they always looked the same (rule `CLOSE`). The
     ///   pair is removed.
-    /// - Both are present in this frame: the pair is removed if they do not satisfy the rule of `self`, or share too
-    ///   many frames.
-    /// - One of them is missing in this frame: the count of shared frames is lowered.
+    /// - Both are present in this frame: the overlap score rises by 1. The pair is removed if the score exceeds
+    ///   [`MAX_OVERLAP_SCORE`], or if the tracks do not satisfy the rule of `self`.
+    /// - One of them is missing in this frame: the overlap score falls by 1, down to 0.
     fn update_pairs(&mut self, tracks: &[OpenTrack]) {
         let find = |number: u32| tracks.binary_search_by_key(&number, |track| track.number).ok().map(|at| &tracks[at]);
         let rule = self.rule;
@@ -179,14 +179,14 @@ impl JoinedTracks {
                 false
             }
             (Some(a), Some(b)) if a.frames_since_seen == 1 && b.frames_since_seen == 1 => {
-                pair.shared_frames += 1;
+                pair.overlap_score += 1;
                 pair.are_close &= cost(&a.appearance, &b.appearance, &CLOSE) <= 1.0;
-                pair.shared_frames <= MAX_SHARED_FRAMES && cost(&a.appearance, &b.appearance, rule) <= 1.0
+                pair.overlap_score <= MAX_OVERLAP_SCORE && cost(&a.appearance, &b.appearance, rule) <= 1.0
             }
             // If a Gaussian reappears often, a track that fades out may be joined to the second track that fades in
-            // after it. So frames in which one of the two tracks is missing reduce the count of shared frames.
+            // after it. So frames in which one of the two tracks is missing lower the overlap score.
             _ => {
-                pair.shared_frames = pair.shared_frames.saturating_sub(1);
+                pair.overlap_score = pair.overlap_score.saturating_sub(1);
                 true
             }
         });
@@ -226,7 +226,7 @@ impl JoinedTracks {
     }
 
     /// Ends the joining of tracks (Gaussians followed through frames) by one rule. `linker` has linked the last frame.
-    /// Returns for each track the number of its joined track, then the number of joined tracks.
+    /// Returns for each track the number of the joined track to which it belongs, then the number of joined tracks.
     fn finish(mut self, linker: &Linker) -> (Vec<u32>, usize) {
         let open_tracks = linker.open_tracks();
         self.pairs.retain_mut(|pair| {
@@ -252,8 +252,9 @@ impl JoinedTracks {
 }
 
 /// Returns the cost of joining two tracks (Gaussians followed through frames) by `rule`: their squared distance plus
-/// the difference of their appearances, both scaled by `rule`. The tracks may be joined if the cost is at most 1.
-/// Opacity does not count. Returns infinity if one Gaussian is more than √2 times as large as the other.
+/// the difference of their appearances, both scaled by `rule` ([`ComparedAppearance::distance_cost`]). The tracks may
+/// be joined if the cost is at most 1. Opacity is not compared. Returns infinity if one Gaussian is more than √2 times
+/// as large as the other.
 fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     if (a.ln_size - b.ln_size).abs() > MAX_LN_SIZE_RATIO {
         return f32::INFINITY;

@@ -16,9 +16,10 @@ use crate::model::Gaussians;
 /// it ends.
 pub const MAX_GAP_FRAMES: u32 = 3;
 /// Parameters of the test whether a Gaussian has taken the place of a track (Gaussian followed through frames) that has
-/// no Gaussian in this frame. The first is the distance from the expected position, in sizes of the Gaussian, that adds
-/// 1 to the cost. The second is the factor by which the difference in appearance is multiplied. The Gaussian passes the
-/// test if the cost is at most 1.
+/// no Gaussian in this frame. The Gaussian passes the test if a cost is at most 1. The first parameter is the distance
+/// from the expected position that adds 1 to the cost, in units of a size: the smaller one of the sizes of this
+/// Gaussian and of the track's last Gaussian. The second is the factor by which the difference in appearance is
+/// multiplied in the cost.
 const SUCCESSION: (f32, f32) = (0.25, 1.0);
 /// Minimum number of Gaussians of a frame for the detection of cuts (frames whose content is unrelated to the frame
 /// before).

@@ -37,23 +37,24 @@
 //!    have a cost of at most C; ¼ is the assumed probability that the track's own Gaussian is absent. The least certain
 //!    links are dropped and their Gaussians begin new tracks, until at most one of 200 remaining links is expected to
 //!    be wrong ([`FrameLinks::doubtful`]).
-//! 5. *Cuts.* Of this frame and the previous one, take the smaller number of Gaussians. If it is at least 16, and fewer
-//!    than a quarter of it are linked, everything has moved at once. This is a cut, at which all tracks end.
+//! 5. *Cuts.* Let N be the smaller one of the numbers of Gaussians in this frame and in the previous one. If N is at
+//!    least 16, and fewer than N/4 Gaussians are linked, everything has moved at once. This is a cut, at which all
+//!    tracks end.
 //! 6. *Joined tracks* ([`Joiner`]). Two tracks may be parts of one Gaussian that fades out as one and fades in as the
 //!    other. A track that begins is paired with the four earlier tracks of least cost
 //!    |x_b − x_a|² / (r·min(s_a, s_b))² + q·A, where A excludes opacity. The cost must be at most 1, the sizes must
 //!    agree within a factor of √2, and the earlier track must not be succeeded. There are two rules: r = 4 and q = 1/16
 //!    (*alike*), and r = q = 1 (*close*). A track that began because its link was doubtful (rule 4) is only paired with
-//!    close tracks. Both tracks of a pair may be present together in four frames, in each of which the rule must hold,
-//!    plus one more for each earlier frame in which one of them was missing. When the earlier track of the cheapest
-//!    pair has ended, the later track is joined to it. Joins are made in the order of cost. Each track is joined to
-//!    at most one earlier track, and at most one later track is joined to it. A later track that ends while the earlier
-//!    one continues was a part of it if they were close. Tracks of one joined track that are present together are
-//!    [blended](blend_rows).
+//!    close tracks. Each pair has an overlap score: a frame with both tracks adds 1, a frame without one of them
+//!    subtracts 1, down to 0. A pair is dropped if its score exceeds 4, or if the rule does not hold in a frame with
+//!    both tracks. When the earlier track of the cheapest pair has ended, the later track is joined to it. Joins are
+//!    made in the order of cost. Each track is joined to at most one earlier track, and at most one later track is
+//!    joined to it. A later track that ends while the earlier one continues was a part of it if they were close. Tracks
+//!    of one joined track that are present together are [blended](blend_rows).
 //!
-//! Tracks are numbered in the order of their births, and within a frame in its order. A Gaussian with a NaN is never
-//! compared: it continues a track only as an exact repeat. Colors are compared without the higher SH degrees, which
-//! rotate with the Gaussian.
+//! Tracks are numbered in the order in which they begin; tracks that begin in one frame, in the order of their
+//! Gaussians. A Gaussian with a NaN is never compared: it continues a track only as an exact repeat. Colors are
+//! compared without the higher SH degrees, which rotate with the Gaussian.
 //!
 //! Gaussians are found with one grid for every octave of sizes. In a cell with more than 64 Gaussians, only the 64 of
 //! the nearest brightness are compared, so thousands at one place cost no more than elsewhere.

@@ -279,13 +279,13 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
 /// and difference in appearance).
 ///
 /// - Key: number of the later track, then the bits of the cost of the pair.
-/// - Value: number of the earlier track; count of shared frames (a frame with both tracks adds 1, a frame without one
-///   of them subtracts 1, down to 0); whether the two tracks look the same (rule *close*); whether the earlier track
-///   has ended (has had no Gaussian for more than [`MAX_GAP_FRAMES`] frames).
+/// - Value: number of the earlier track; overlap score (a frame with both tracks adds 1, a frame without one of them
+///   subtracts 1, down to 0); whether the two tracks look the same (rule *close*); whether the earlier track has ended
+///   (has had no Gaussian for more than [`MAX_GAP_FRAMES`] frames).
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
 /// Joins tracks (Gaussians followed through frames) that belong to one Gaussian: one track ends where and when a
-/// similar one begins. Returns for every track the number of its joined track.
+/// similar one begins. Returns for every track the number of the joined track to which it belongs.
 ///
 /// - `in_doubt`: numbers of the tracks that began because a link was probably wrong.
 /// - `succeeded`: pairs (frame, track). The track has no Gaussian in this frame, and another Gaussian has replaced its
@@ -313,7 +313,7 @@ pub(super) fn slow_joined_tracks(
     let mut pairs = TrackPairs::new();
     for frame in 0..frames {
         let mut absorbed = Vec::new();
-        pairs.retain(|&(b, _), (a, shared_frames, close, ended)| {
+        pairs.retain(|&(b, _), (a, overlap_score, close, ended)| {
             if is_gone(*a, frame) {
                 *ended = true;
                 return true;
@@ -325,12 +325,12 @@ pub(super) fn slow_joined_tracks(
                 return false;
             }
             let (Some(seen_a), Some(seen_b)) = (tracks[*a].get(&frame), tracks[b].get(&frame)) else {
-                *shared_frames = shared_frames.saturating_sub(1);
+                *overlap_score = overlap_score.saturating_sub(1);
                 return true;
             };
-            *shared_frames += 1;
+            *overlap_score += 1;
             *close &= cost(seen_a, seen_a.position, seen_b, (1.0, 1.0)) <= 1.0;
-            *shared_frames <= 4 && cost(seen_a, seen_a.position, seen_b, (r, q)) <= 1.0
+            *overlap_score <= 4 && cost(seen_a, seen_a.position, seen_b, (r, q)) <= 1.0
         });
         for (b, a) in absorbed {
             predecessor[b] = predecessor[b].or(Some(a));

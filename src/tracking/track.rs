@@ -5,9 +5,9 @@ use super::grid::CellGrid;
 
 /// Maximum number of Gaussians that are considered as the continuation of a track (Gaussian followed through frames).
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Maximum of the allowance for speed in the cost of a link, as a multiple of the size of the track's Gaussian. In this
-/// cost, the distance between the expected and the actual position is divided by a length: the size of the Gaussian
-/// plus an allowance that grows with its speed.
+/// Maximum of the term for speed in the length unit u of a track, as a multiple of the size of the track's Gaussian
+/// ([`OpenTrack::distance_unit`]). The cost of a link divides the distance between the expected and the actual position
+/// by u.
 const MAX_SPEED_UNITS: f32 = 3.0;
 /// Number that stands for no track (Gaussian followed through frames), or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
@@ -48,8 +48,8 @@ pub(super) struct OpenTrack {
     pub(super) is_succeeded: bool,
 }
 
-/// Gaussian that may continue a track (Gaussian followed through frames), and the cost of the link between the track
-/// and it: distance and difference in appearance.
+/// Gaussian that may continue a track (Gaussian followed through frames), and the cost of linking it to the track:
+/// distance and difference in appearance.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) struct Candidate {
     pub(super) cost: f32,
@@ -69,8 +69,9 @@ impl OpenTrack {
         std::array::from_fn(|c| self.appearance.position[c] + self.frames_since_seen as f32 * velocity[c])
     }
 
-    /// Returns the length by which distances are divided in the cost of a link, scene units: the Gaussian's size, plus
-    /// an allowance that grows with its speed and is at most [`MAX_SPEED_UNITS`] sizes.
+    /// Returns the length unit u = s + min(½·n·|v|, 3·s) of the track, in scene units. The cost of a link divides
+    /// distances by u, so fast Gaussians are searched for in a larger region. s is the size of the track's Gaussian, v
+    /// its velocity per frame, n the number of frames since it was last seen; 3 is [`MAX_SPEED_UNITS`].
     fn distance_unit(&self) -> f32 {
         let speed = self.velocity.unwrap_or_default().iter().map(|v| v * v).sum::<f32>().sqrt();
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
@@ -129,8 +130,8 @@ impl OpenTrack {
     }
 }
 
-/// Gaussians that may continue a track (Gaussian followed through frames), at most [`MAX_CANDIDATES`]: those with the
-/// lowest costs (distance and difference in appearance), in the order of cost.
+/// Gaussians that may continue a track (Gaussian followed through frames): the [`MAX_CANDIDATES`] Gaussians with the
+/// lowest costs (distance and difference in appearance), or fewer, in increasing order of cost.
 pub(super) struct Candidates {
     best: [Candidate; MAX_CANDIDATES],
 }
