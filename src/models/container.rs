@@ -80,8 +80,8 @@ impl InputModel for Container {
     }
 }
 
-/// Returns size and value range of every column (attribute) of the container, computed from its index of tiles (blocks
-/// of Gaussians × frames). Fails if the index cannot be read.
+/// Returns size and value range of every column (attribute) of the container, from its index of tiles (blocks of
+/// Gaussians × frames). Fails if the index cannot be read.
 fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
     let layout = reader.layout();
     let mut out = Vec::new();

@@ -110,8 +110,8 @@ pub trait InputModel: Send + Sync {
         None
     }
 
-    /// Returns the number n of training frames if the input gives it. Frame i lies at the fraction i/n of the time
-    /// span, so the last frame is one frame interval before the end of the time span.
+    /// Returns the number n of training frames if the input gives it. Frame i, counted from 0, lies at the fraction i/n
+    /// of the time span. So the last frame is one frame interval before the end of the time span.
     fn data_frames(&self) -> Option<usize> {
         None
     }
@@ -201,8 +201,8 @@ pub trait InputModel: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// Returns whether the frames may be linked again (Gaussians matched between frames), although the input already
-    /// identifies each Gaussian across frames.
+    /// Returns whether the user may ask to link the frames anew, that is, to match the Gaussians of different frames,
+    /// although the input already identifies each Gaussian across frames.
     fn may_be_linked(&self) -> bool {
         false
     }
@@ -267,18 +267,18 @@ pub struct MemoryProfile {
     /// Bytes of memory per Gaussian of a copy of the compressed model, from which its frames are read.
     pub reduced: u64,
     /// Bytes of memory per Gaussian of the derivative (Jacobian) of frame states with respect to stored parameters; 0
-    /// if the Jacobian is the identity, because states change by as much as stored parameters do.
+    /// if a change of a stored parameter changes the states by the same amount, so that no derivative is stored.
     pub jacobian: u64,
     /// Bytes of memory per Gaussian of the values that [`Deformation::with_params`] computes once for all frames; 0 if
     /// it computes none.
     ///
     /// [`Deformation::with_params`]: crate::source::Deformation::with_params
     pub prepared: u64,
-    /// Bytes per Gaussian of a memory-mapped file that is read as a whole.
+    /// Bytes per Gaussian of a memory-mapped input file that is read as a whole.
     pub file: u64,
     /// Bytes of memory that the open input takes regardless of its number of Gaussians.
     pub fixed: u64,
-    /// Number of frames that are decoded together, all of which a reader may keep in memory; 0 if each frame is read
+    /// Number of frames that are decoded together; a reader may keep all of them in memory. 0 if each frame is read
     /// alone.
     pub frame_block: u64,
     /// Number of Gaussians that are decoded together, in one block.
@@ -383,8 +383,8 @@ impl<'a> FoundInput<'a> {
         !self.is_folder && self.head.starts_with(b"PK") && !is_npz
     }
 
-    /// Returns whether the file begins with `magic` or has `extension`. The extension also catches files whose first
-    /// bytes are damaged.
+    /// Returns whether the path is a file that begins with `magic` or has the extension `extension`. The extension also
+    /// catches files whose first bytes are damaged.
     pub(super) fn is_file_of(&self, magic: &[u8], extension: &str) -> bool {
         let named = || self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension));
         !self.is_folder && (self.head.starts_with(magic) || named())
@@ -468,8 +468,8 @@ impl OpenOptions {
         PlyOptions { scratch: self.scratch(), memory: self.memory, events: self.events.clone() }
     }
 
-    /// Fails if the user gave `--iteration`, because the input at `path` is not a model folder and so has no training
-    /// iterations.
+    /// Fails if the user gave `--iteration`. Called for an input at `path` that is not a model folder and so has no
+    /// training iterations.
     pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
         match self.iteration {
             Some(_) => Err(Error::usage(format!("{}: --iteration applies to model folders only", path.shown()))),

@@ -1,6 +1,6 @@
 //! Model formats: each recognizes, opens, evaluates and writes the models of one trainer.
 //!
-//! A model format is one module in this folder and one line of `MODEL_FORMATS`. Code outside its module never asks
+//! A model format is one module in this folder, with its entries in `MODEL_FORMATS`. Code outside its module never asks
 //! which format an input has.
 
 pub mod archive;

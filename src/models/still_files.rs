@@ -102,7 +102,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     },
 };
 
-/// Returns the format of the file, or of the files in the folder, that was found at a path; `None` if it is none of
+/// Returns the file format of `found`, which is a file or a folder of files; `None` if the format is none of
 /// [`FORMATS`].
 fn format_of(found: &FoundInput) -> Option<&'static StillFormat> {
     let holds_frames = |format: &StillFormat| {

@@ -169,7 +169,7 @@ pub fn pack_stream(
 }
 
 /// Returns the number of frames per tile of the container: as many as fit into [`HELD_BYTES`], between 1 and
-/// [`FRAME_BLOCK`]. It depends only on the header of the stream, so that the bytes of the container do too.
+/// [`FRAME_BLOCK`]. It depends only on the header of the stream, so the same stream always gives the same container.
 pub fn frames_per_tile(header: &StreamHeader) -> usize {
     (HELD_BYTES / header.frame_bytes().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
 }

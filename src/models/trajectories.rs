@@ -42,7 +42,7 @@ pub fn state_bytes(sh_degree: usize, columns: Attributes) -> u64 {
     columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
 
-/// Returns the frames of `source` after Gaussians have been removed and merged as `reduction` says.
+/// Returns the frames of `source` after Gaussians have been removed and merged as `reduction` says, without its deltas.
 pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a CompressedModel) -> MergedSequence<'a> {
     let members = reduction.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
     MergedSequence::new(source, &reduction.kept, members, &reduction.merge_params)
@@ -54,8 +54,8 @@ pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
     reduction: &'a CompressedModel,
 ) -> Box<dyn FrameSource + 'a> {
-    let CompressedModel { delta: change, trajectory_delta: course, sh_degree, .. } = reduction;
-    Box::new(SourceWithDeltas::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
+    let CompressedModel { delta, trajectory_delta, sh_degree, .. } = reduction;
+    Box::new(SourceWithDeltas::new(Box::new(merged(source, reduction)), delta, trajectory_delta, *sh_degree))
 }
 
 /// Fails if a sequence of `frames` frames cannot be written as the kind of output `kind` to `path`. The message says
@@ -92,9 +92,9 @@ pub(super) fn write_trajectories(
 }
 
 /// Writes the compressed model `reduction` of `source`, which has proxies (Gaussians that replace merged ones), to
-/// `path` as a container. Writes the frame blocks one after another, and each of them in ranges of output Gaussians,
-/// because the members of a proxy (merged Gaussians) can be anywhere in the source. A range is computed from at most
-/// `max_gaussians` source Gaussians, which are kept in memory; a single block of Gaussians may need more.
+/// `path` as a container. Writes one block of frames after another, and each of them in ranges of output Gaussians. A
+/// range is computed from at most `max_gaussians` source Gaussians, which are kept in memory, because the members of a
+/// proxy (merged Gaussians) can be anywhere in the source. A single block of Gaussians may need more.
 fn write_merged(
     source: &dyn FrameSource,
     reduction: &CompressedModel,
@@ -128,8 +128,8 @@ fn write_merged(
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
             let change = reduction.delta.pick(&places);
             // Compressed models with proxies have no delta that varies in time.
-            let course = TrajectoryDelta::default();
-            let held = SourceWithDeltas::new(Box::new(held), &change, &course, reduction.sh_degree);
+            let no_trajectory_delta = TrajectoryDelta::default();
+            let held = SourceWithDeltas::new(Box::new(held), &change, &no_trajectory_delta, reduction.sh_degree);
             writer.add_gaussians(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
     }

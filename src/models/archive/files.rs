@@ -24,7 +24,7 @@ pub(crate) const CFG_ARGS: &str = "cfg_args";
 pub(crate) const ITERATION: &str = "iteration";
 
 /// Adds to `content` all data of the PLY file `template` that are not attributes: the extra properties of the Gaussians
-/// whose rows in the file are `rows`, and the bytes before and after the rows of Gaussians.
+/// in the rows `rows` of the file, and the bytes of the file before and after the rows of Gaussians.
 ///
 /// # Errors
 /// Fails if the template was cut short since it was opened, or if its data need more memory than allowed.

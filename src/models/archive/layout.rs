@@ -35,8 +35,8 @@ const MAX_PATH: usize = 256;
 const DEVICES: [&str; 4] = ["con", "prn", "aux", "nul"];
 /// Beginnings of file names that Windows reserves for devices if a digit follows, such as `com1`.
 const NUMBERED_DEVICES: [&str; 2] = ["com", "lpt"];
-/// Increase of the bits of a half-precision number, read as an integer, when the number is doubled. Doubling is one
-/// octave.
+/// Number by which the bits of a half-precision number, read as an integer, increase when the number is doubled. One
+/// doubling is one octave.
 const BITS_PER_OCTAVE: f32 = 1024.0;
 
 /// Layout of a model in an archive: the files of the model, and which bytes of each file are values.
@@ -98,8 +98,8 @@ pub(super) enum Field {
     F32(usize),
     /// Value of the plane (scalar component of all Gaussians) with this index, converted to half precision.
     Half(usize),
-    /// Nonnegative half-precision number on a logarithmic scale. Its bits, read as an integer, are 1024 times the value
-    /// of the plane (scalar component of all Gaussians) with this index. The value of the plane is thus about 15 plus
+    /// Nonnegative half-precision number on a logarithmic scale. The value of the plane (scalar component of all
+    /// Gaussians) with this index is the bits of the number, read as an integer, divided by 1024. It is about 15 plus
     /// the binary logarithm of the number.
     Octaves(usize),
     /// Byte that is 255 times the value of the plane (scalar component of all Gaussians) with this index.
@@ -152,9 +152,9 @@ impl Field {
     }
 }
 
-/// Returns the index, in an archive, of the first plane (scalar component) after those of the standard attributes. The
-/// planes from this index on hold values that only the model's format has. `sh_degree` determines the number of planes
-/// of the standard attributes.
+/// Returns the index, in an archive, of the first plane (scalar component of all Gaussians) after those of the standard
+/// attributes: position, rotation, log scale, opacity and SH coefficients. The planes from this index on hold values
+/// that only the model's format has. `sh_degree` determines the number of SH planes.
 pub(super) fn first_column_plane(sh_degree: usize) -> usize {
     first_plane(Attributes::SH) + 3 * sh_coefficients(sh_degree)
 }
@@ -281,7 +281,7 @@ impl Layout {
     /// Fails if the content does not match the layout or a write fails.
     pub(super) fn write(&self, content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
         self.check_size(content, path)?;
-        // Offset of the next extra bytes, in the bytes of a Gaussian.
+        // Number of extra bytes per Gaussian that the files so far have used.
         let mut extra_offset = 0;
         for (k, file) in self.files.iter().enumerate() {
             let bytes = assemble(content, k, file, &mut extra_offset)

@@ -62,8 +62,8 @@ const FORMATS_WITH_LAYOUT: [ModelFormat; 8] = [
     dynamic_3d_gaussians::ENTRY,
 ];
 
-/// Reads the archive at `path`. Returns its decoded content, and the bytes that Gaussians, deformation field and the
-/// rest of the archive take.
+/// Reads the archive at `path`. Returns its decoded content, and the numbers of bytes that the Gaussians, the
+/// deformation field and all other data take in the archive.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`.

@@ -61,7 +61,7 @@ impl FileContent<'_> {
     }
 }
 
-/// Location of one value of each Gaussian in the content of an archive.
+/// Place in the content of an archive where a value of each Gaussian is stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Target {
     /// Component of an attribute: the attribute, and the index of the component.
@@ -140,7 +140,7 @@ impl Packer {
     ///
     /// # Errors
     /// Fails if a file cannot be read or has a layout that an archive cannot hold.
-    pub(in crate::models) fn add<'a>(
+    pub(in crate::models) fn pack<'a>(
         mut self,
         path: &Path,
         holds: impl Fn(&str) -> FileContent<'a>,
@@ -178,16 +178,16 @@ impl Packer {
         self.memory.check(file, "", "the file and its values", 2 * length)?;
         let mut bytes = fs::read(file).map_err(Error::io("read", file))?;
         let mut spans = match holds {
-            FileContent::Ply => self.ply(file, &bytes)?,
-            FileContent::Splatv => self.splatv(file, &bytes)?,
-            FileContent::Weights => self.weights(&name, file)?,
-            FileContent::Checkpoint(rows) => self.checkpoint(rows, file, &bytes)?,
+            FileContent::Ply => self.add_ply(file, &bytes)?,
+            FileContent::Splatv => self.add_splatv(file, &bytes)?,
+            FileContent::Weights => self.add_weights(&name, file)?,
+            FileContent::Checkpoint(rows) => self.add_checkpoint(rows, file, &bytes)?,
             FileContent::Npz(axis) => {
                 if let Some(stored) = without_compression(&bytes).map_err(Error::io("read", file))? {
                     fs::write(file, &stored).map_err(Error::io("write", file))?;
                     bytes = stored;
                 }
-                self.npz(file, &bytes, axis)?
+                self.add_npz(file, &bytes, axis)?
             }
             FileContent::Other if name == "cfg_args" => {
                 bytes = cfg_args::with_file_names_only(&cfg_args::read(file)?, file)?.into_bytes();
@@ -221,7 +221,7 @@ impl Packer {
     /// Adds the rows of a file to the archive, one row per Gaussian. `bytes` is the content of the file, `at` the
     /// offset of the first row in it, and `fields` describes the fields of a row in order. Returns the [`Span`] (part
     /// of a file with values) that describes the rows, and their length in bytes.
-    fn rows(&mut self, file: &Path, bytes: &[u8], at: usize, fields: &[RowField]) -> Result<(Span, usize)> {
+    fn add_rows(&mut self, file: &Path, bytes: &[u8], at: usize, fields: &[RowField]) -> Result<(Span, usize)> {
         let count = self.content.cloud.len();
         let stride: usize = fields.iter().map(|field| field.bytes).sum();
         let length = count * stride;
@@ -289,9 +289,9 @@ impl Packer {
         first_column_plane(self.content.cloud.sh_degree()) + first
     }
 
-    /// Adds the Gaussians of a PLY to the archive. Returns the spans (parts of the file with values) that were added,
-    /// each with its length in bytes.
-    fn ply(&mut self, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
+    /// Adds the Gaussians of a PLY to the archive. Returns the added spans (parts of the file with values), each with
+    /// its length in bytes.
+    fn add_ply(&mut self, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let ply = Ply::open(file)?;
         if ply.header().encoding != PlyEncoding::LittleEndian {
             return Err(cannot_hold(file, "a PLY that is not little-endian binary"));
@@ -305,12 +305,12 @@ impl Packer {
             other => RowField::exact(other.bytes()),
         };
         let fields: Vec<RowField> = ply.properties().iter().map(field).collect();
-        Ok(vec![self.rows(file, bytes, at, &fields)?])
+        Ok(vec![self.add_rows(file, bytes, at, &fields)?])
     }
 
     /// Adds the Gaussians of a `.splatv` file to the archive; see [`crate::files::splatv`] for their layout. Returns
-    /// the spans (parts of the file with values) that were added, each with its length in bytes.
-    fn splatv(&mut self, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
+    /// the added spans (parts of the file with values), each with its length in bytes.
+    fn add_splatv(&mut self, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let splatv = Splatv::open(file)?;
         let at = splatv.start();
         let attribute = Target::Attribute;
@@ -328,15 +328,15 @@ impl Packer {
         fields.push(RowField::half(column("center")));
         fields.push(RowField::octaves(column("width")));
         debug_assert_eq!(fields.iter().map(|field| field.bytes).sum::<usize>(), ROW_BYTES);
-        Ok(vec![self.rows(file, bytes, at, &fields)?])
+        Ok(vec![self.add_rows(file, bytes, at, &fields)?])
     }
 
-    /// Adds the tensors of a state dict to the archive as values. Returns the spans (parts of the file with values)
-    /// that were added, each with its length in bytes. A tensor is stored as unchanged bytes instead if it
+    /// Adds the tensors of the state dict `file` to the archive as values. Returns the added spans (parts of the file
+    /// with values), each with its length in bytes. A tensor is stored as unchanged bytes instead if it
     /// - is not f32, or has values that are not finite,
     /// - is empty or not stored contiguously,
     /// - shares bytes of the file with an earlier tensor.
-    fn weights(&mut self, name: &str, file: &Path) -> Result<Vec<(Span, usize)>> {
+    fn add_weights(&mut self, name: &str, file: &Path) -> Result<Vec<(Span, usize)>> {
         let checkpoint = Checkpoint::open(file, self.memory)?;
         let mut spans: Vec<(Span, usize)> = Vec::new();
         for (k, tensor) in checkpoint.tensors().enumerate() {
@@ -360,11 +360,11 @@ impl Packer {
         Ok(spans)
     }
 
-    /// Adds the tensors of the checkpoint at `file`, whose content is `bytes`, to the archive. `rows` describes the
-    /// tensors of the checkpoint from which the model was read. The description also applies to this checkpoint, which
-    /// was written as a copy with the same tree of objects. Returns the spans (parts of the file with values) that were
-    /// added, each with its length in bytes.
-    fn checkpoint(&mut self, rows: &RowTensors, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
+    /// Adds the tensors of the checkpoint at `file`, whose content is `bytes`, to the archive. Returns the added spans
+    /// (parts of the file with values), each with its length in bytes. `rows` describes the tensors of the checkpoint
+    /// from which the model was read. The description also applies to `file`, which was written as a copy of that
+    /// checkpoint with the same tree of objects.
+    fn add_checkpoint(&mut self, rows: &RowTensors, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let checkpoint = Checkpoint::open(file, self.memory)?;
         let mut spans = Vec::new();
         let find = |id| checkpoint.tensor(id).ok_or_else(|| cannot_hold(file, "a tensor that was not written"));
@@ -394,12 +394,12 @@ impl Packer {
             let target = |element: &RowElement| match element {
                 RowElement::Unread => Target::Zeros,
                 _ if tensor.kind != ValueType::F32 => Target::Bytes,
-                RowElement::Of(attribute, c) => Target::Attribute(*attribute, *c),
+                RowElement::Attribute(attribute, c) => Target::Attribute(*attribute, *c),
                 RowElement::Own(_) => Target::Column(name.to_owned()),
             };
             let field = |element: &RowElement| RowField { bytes: bytes_per_value, ..RowField::f32(target(element)) };
             let fields: Vec<RowField> = stored.iter().map(field).collect();
-            spans.push(self.rows(file, bytes, place.start, &fields)?);
+            spans.push(self.add_rows(file, bytes, place.start, &fields)?);
         }
         for id in rows.training_only() {
             let tensor = find(id)?;
@@ -413,9 +413,9 @@ impl Packer {
     }
 
     /// Adds the arrays of a NumPy archive without compression to the archive. `axis` returns for an array which of its
-    /// axes counts the Gaussians, and the attribute that it holds. Returns the spans (parts of the file with values)
-    /// that were added, each with its length in bytes.
-    fn npz(
+    /// axes counts the Gaussians, and the attribute that the array holds. Returns the added spans (parts of the file
+    /// with values), each with its length in bytes.
+    fn add_npz(
         &mut self,
         file: &Path,
         bytes: &[u8],
@@ -442,7 +442,7 @@ impl Packer {
                 for frame in 0..frames {
                     bytes_of(frame).ok_or_else(|| cannot_hold(file, "an array that is cut short"))?;
                     let fields = [RowField::exact(width * value_bytes)];
-                    spans.push(self.rows(file, bytes, at + frame * frame_bytes, &fields)?);
+                    spans.push(self.add_rows(file, bytes, at + frame * frame_bytes, &fields)?);
                 }
                 continue;
             }

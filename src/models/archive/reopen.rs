@@ -16,7 +16,7 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
-/// Function and options with which an input model was opened. They serve to open the model again after it was stored in
+/// Function and options with which an input model was opened. They serve to open it again after it has been stored in
 /// an archive (`.gsz`).
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Reopener {
@@ -35,8 +35,8 @@ impl Reopener {
         Reopener { open, options }
     }
 
-    /// Returns the content of an archive of `reduction`, the compressed form of `model`. The compressed model is first
-    /// written to a temporary folder, as the kind of output `kind`, to a file or folder called `name`. `holds` returns
+    /// Returns the content of an archive of `reduction`, the compressed form of `model`. First writes the compressed
+    /// model to a temporary folder, as the kind of output `kind`, to a file or folder called `name`. `holds` returns
     /// the kind of content of a written file, given the path of the file relative to the model folder.
     ///
     /// # Errors
@@ -55,7 +55,7 @@ impl Reopener {
         }
         model.write(reduction, kind, &path, &Limits::NONE, &Events::default())?;
         let degree = model.source().info().sh_degree.min(reduction.sh_degree);
-        Packer::new(reduction.len(), degree, self.options.memory).add(&path, holds)
+        Packer::new(reduction.len(), degree, self.options.memory).pack(&path, holds)
     }
 
     /// Opens the model whose archive has the content `content`, and returns its frames at `times`.

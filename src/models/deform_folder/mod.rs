@@ -54,8 +54,8 @@ pub(super) trait NetworkMotionModel: MotionModel {
     /// Returns the bytes of memory per Gaussian of the values prepared by [`MotionModel::prepare`].
     fn bytes_per_gaussian(&self) -> usize;
 
-    /// Returns the bytes of memory that the motion model takes regardless of the number of Gaussians, besides the
-    /// network.
+    /// Returns the bytes of memory that the motion model takes in addition to the network and to the values of each
+    /// Gaussian.
     fn bytes(&self) -> usize {
         0
     }

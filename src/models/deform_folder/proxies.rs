@@ -30,8 +30,8 @@ const STEPS: usize = 2;
 /// target state.
 const CORRECTIONS: usize = 3;
 /// Damping of a Gauss-Newton step: this fraction of the mean diagonal element of the normal matrix is added to each
-/// diagonal element. It hardly changes the step if the normal matrix is well conditioned, as when the position moves
-/// alike in all frames. It shortens the step of a badly conditioned matrix.
+/// diagonal element. The damping hardly changes the step if the normal matrix is well conditioned, for example if the
+/// position moves alike in all frames. It shortens the step if the matrix is badly conditioned.
 const DAMPING: f64 = 1e-3;
 
 /// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`, one row
@@ -109,9 +109,9 @@ fn position(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// Returns for each Gaussian of `raw` (stored parameters) the squared distance between the position that `model`
-/// computes and its target position, summed over `frames`, in scene units squared. `wanted(k, row)` returns the target
-/// position at frame `frames[k]` of the Gaussian in row `row`.
+/// Returns for each Gaussian of `raw` (stored parameters) the sum over `frames` of the squared distance between the
+/// position that `model` computes and a target position, in scene units squared. `wanted(k, row)` returns the target
+/// position of the Gaussian in row `row` at frame `frames[k]`.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -129,9 +129,9 @@ fn squared_distances<L: NetworkMotionModel>(
     Ok(off)
 }
 
-/// Returns the stored parameters `raw` of proxies (Gaussians that replace merged ones), with the position of every
-/// proxy moved by one Gauss-Newton step that brings its path nearer to its target. `wanted` holds the target states of
-/// all proxies, one entry for each of `frames`.
+/// Returns the stored parameters `raw` of proxies (Gaussians that replace merged ones) with other positions. The
+/// position of every proxy is moved by one Gauss-Newton step, which brings its path nearer to its target. `wanted`
+/// holds the target states of all proxies, one entry for each of `frames`.
 fn gauss_newton_step<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -189,7 +189,7 @@ fn fit_parameters<L: NetworkMotionModel>(
         let mut state = Gaussians::zeros(0, own.sh_degree());
         for (&frame, wanted) in frames.iter().zip(wanted) {
             model.with_params(made).state(frame, Attributes::all(), &mut state)?;
-            all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add(wanted, &state, row));
+            all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add_frame(wanted, &state, row));
             if wanted.sh.len() == made.len() {
                 // SH coefficients are compared at one frame only: their change over time is the same at all frames.
                 for c in 0..state.sh.width() {
@@ -213,21 +213,23 @@ fn fit_parameters<L: NetworkMotionModel>(
     Ok(())
 }
 
-/// Target state minus actual state of one proxy (Gaussian that replaces merged ones), summed over frames.
+/// Differences between the target and the actual state of one proxy (Gaussian that replaces merged ones), target minus
+/// actual, each summed over frames: of the scales (scene units), of the quaternions and of the opacities. In the
+/// difference of quaternions, both have the length of the actual one.
 #[derive(Clone, Copy, Default)]
 struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squared difference between a proxy (Gaussian that replaces a merged cluster) and its target, in log scales and
-    /// in unit quaternions, summed over frames and over the components of both.
+    /// Sum over frames and components of the squared differences between target and actual state, in log scales and in
+    /// unit quaternions.
     off: f64,
 }
 
 impl StateDifference {
-    /// Adds the difference of one proxy (Gaussian that replaces a merged cluster) at one frame: its target state (row
-    /// `row` of `wanted`) minus its state (row `row` of `state`).
-    fn add(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
+    /// Adds one frame to the sums of one proxy (Gaussian that replaces a merged cluster). Its target state at this
+    /// frame is row `row` of `wanted`, its actual state is row `row` of `state`.
+    fn add_frame(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
         let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
         for c in 0..3 {
             self.scale[c] += to[c].exp() - from[c].exp();
@@ -246,7 +248,7 @@ impl StateDifference {
     }
 
     /// Adds the mean difference per frame to the stored parameters of the proxy (Gaussian that replaces a merged
-    /// cluster) in row `row` of `to`. `share` is 1 divided by the number of frames that were added.
+    /// cluster) in row `row` of `to`. `share` is 1 divided by the number of added frames.
     fn apply<L: NetworkMotionModel>(&self, share: f64, to: &mut Gaussians, row: usize) {
         let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
         let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(MIN_SCALE).ln() as f32);

@@ -52,8 +52,8 @@ impl TestModel {
         }
     }
 
-    /// Creates a model of SC-GS with 12 control nodes, 2 features per Gaussian (`hyper_dim`), a motion mask (factor on
-    /// the motion of each Gaussian), and a network with random weights and the variant `kind`.
+    /// Creates a model of SC-GS with 12 control nodes and a network with random weights and the variant `kind`. Each
+    /// Gaussian has 2 features (`hyper_dim`), and a motion mask, which is a factor on its motion.
     fn sc_gs(kind: DeepVariant) -> TestModel {
         let mut noise = Noise(23);
         let mut add = |shape: &[usize]| Tensor {

@@ -61,8 +61,8 @@ impl DeformableMotion {
 }
 
 impl DeformableMotion {
-    /// Returns the network's outputs at `time` for a block of Gaussians with the encoded canonical positions `encoded`:
-    /// only those outputs on which the attributes `want` depend.
+    /// Returns the network's outputs at `time` for a block of Gaussians with the encoded canonical positions `encoded`.
+    /// Computes only the outputs on which the attributes `want` depend.
     fn motion(&self, time: f64, encoded: &EncodedPositions, want: Attributes) -> Result<PredictedMotion> {
         let mut motion = PredictedMotion::default();
         let shape = if (want & SHAPE).is_empty() { Attributes::empty() } else { SHAPE };
@@ -135,7 +135,8 @@ impl MotionModel for DeformableMotion {
 
     /// Returns the derivative of the positions at `time` with respect to the stored positions. The derivatives of all
     /// other attributes are left as the identity. Those of rotation and scales are not computed, because the
-    /// decomposition of the covariance into rotation and scales is not continuous from frame to frame.
+    /// decomposition of the covariance into rotation and scales is not continuous from frame to frame; the optimizer
+    /// does not change these two attributes.
     fn jacobian(
         &self,
         time: f64,

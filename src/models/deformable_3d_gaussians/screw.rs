@@ -1,8 +1,8 @@
 //! Screw motions, by which the variant of Deformable-3D-Gaussians with six degrees of freedom moves positions.
 //!
-//! The network outputs w and v, from which θ = |w|. Then w becomes w/θ + 1e-5 and v becomes v/θ + 1e-5 in every
-//! component, so that w is not exactly unit. With W the matrix of the cross product with w, the moved position is x′ =
-//! (I + sin θ·W + (1 − cos θ)·W²)·x + (θ·I + (1 − cos θ)·W + (θ − sin θ)·W²)·v. Source: `exp_se3` of the authors' code.
+//! The network outputs w and v. With θ = |w|, w becomes w/θ + 1e-5 and v becomes v/θ + 1e-5 in every component, so w is
+//! not exactly a unit vector. With W the matrix of the cross product with w, the moved position is x′ = (I + sin θ·W +
+//! (1 − cos θ)·W²)·x + (θ·I + (1 − cos θ)·W + (θ − sin θ)·W²)·v. Source: `exp_se3` of the authors' code.
 
 use glam::DVec3;
 
@@ -10,7 +10,7 @@ use glam::DVec3;
 const EPSILON: f64 = 1e-5;
 /// Minimum angle θ = |w|. Below it, the limit x + v is used, where the original code divides by zero.
 const MIN_ANGLE: f64 = 1e-30;
-/// Half step of numerical derivatives with respect to values of size 1: the cube root of the f64 precision.
+/// Half of the step of central differences for quantities of size 1: the cube root of the precision of f64.
 const HALF_STEP: f64 = 6e-6;
 
 /// Returns the position `x` moved by the screw motion with the network's outputs `w` and `v`.
@@ -25,9 +25,9 @@ pub(super) fn apply_screw(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
     turned + angle * v + rest * w.cross(v) + (angle - sine) * w.cross(w.cross(v))
 }
 
-/// Returns the derivative of the moved position when `x` moves in the direction `axis`. `of_w` and `of_v` are the
-/// derivatives of the network's outputs w and v in this direction. Uses central differences in which x, w and v change
-/// together.
+/// Returns the derivative of the moved position when `x` moves in the direction `axis`. Then the network's outputs w
+/// and v change as well; `of_w` and `of_v` are their derivatives in this direction. The derivative is a central
+/// difference in which x, w and v change together.
 pub(super) fn slope(x: DVec3, w: DVec3, v: DVec3, axis: DVec3, [of_w, of_v]: [DVec3; 2]) -> DVec3 {
     // Screw motions may change fast with x, so the step is shortened accordingly.
     let step = HALF_STEP / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());

@@ -75,8 +75,8 @@ impl<'a> MergedSource<'a> {
         MergedSource { merged: merged(params, reduction), reduction, info }
     }
 
-    /// Finds the proxies (Gaussians that replace merged ones) among the output Gaussians whose indices `places` lists.
-    /// Returns a pair for each proxy: its index in this list, and the index of its cluster (merged Gaussians).
+    /// Finds the proxies (Gaussians that replace merged ones) among the output Gaussians with the indices `places`.
+    /// Returns a pair for each proxy: its position in `places`, and the index of its cluster (merged Gaussians).
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
         let clusters = &self.reduction.clusters;
         let mut by_output: Vec<(u32, usize)> =

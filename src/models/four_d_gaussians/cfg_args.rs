@@ -32,11 +32,12 @@ pub struct ModelConfig {
     /// Number of layers of the trunk, which all heads share; default 1, and 0 means 1. The shapes of the tensors take
     /// precedence.
     pub defor_depth: i64,
-    /// Spatial resolution of each level of feature planes, as a multiple of `resolution`; default `[1, 2, 4, 8]`. The
+    /// For each level of feature planes, the factor on `resolution` along x, y and z; default `[1, 2, 4, 8]`. The
     /// shapes of the tensors take precedence.
     pub multires: Vec<i64>,
-    /// Resolution of the feature planes along x, y, z, t at multiple 1 (see `multires`); default `[64, 64, 64, 25]`.
-    /// The shapes of the tensors take precedence.
+    /// Base resolution of the feature planes along x, y, z and t; default `[64, 64, 64, 25]`. Each level multiplies the
+    /// resolution along x, y and z by its entry of `multires`; the resolution along t is the same in all levels. The
+    /// shapes of the tensors take precedence.
     pub resolution: Vec<i64>,
     /// Number of channels of a feature plane; default 32. The shapes of the tensors take precedence.
     pub channels: i64,
@@ -59,8 +60,8 @@ pub struct ModelConfig {
     pub static_mlp: bool,
     /// Whether a voxel grid provides for each Gaussian a mask: a factor on its stored parameters.
     pub empty_voxel: bool,
-    /// Frequency p of an encoding of the features f from the feature planes: if p is above 1, the network reads f,
-    /// sin(p·f) and cos(p·f) instead of f; default 0, no encoding.
+    /// Frequency p of an encoding of the features f from the feature planes; default 0, no encoding. If p is above 1,
+    /// the network reads f, sin(p·f) and cos(p·f) instead of f alone.
     pub grid_pe: i64,
     /// Whether the field's rotation delta multiplies the stored quaternion instead of being added to it.
     pub apply_rotation: bool,
@@ -204,8 +205,8 @@ pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) 
 }
 
 /// Returns the text of the `cfg_args` file at `path` for an output with SH degree `degree`. `own` is the SH degree of
-/// the input. If `degree` is lower, it replaces the SH degree in the text; otherwise the text is unchanged. Fails if
-/// the file cannot be read.
+/// the input. If `degree` is lower than `own`, `degree` replaces the SH degree in the text; otherwise the text is
+/// unchanged. Fails if the file cannot be read.
 pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
     let text = read(path)?;
     if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }

@@ -72,7 +72,7 @@ impl InputModel for ModelFolder {
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
             OutputKind::Ply => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
-            // Other functions write archives and `.splatv` files.
+            // All other outputs are written from the states at the frames. The caller measures an archive itself.
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }

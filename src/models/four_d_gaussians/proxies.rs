@@ -15,10 +15,10 @@ use crate::source::FrameSource;
 /// Maximum number of frames at which a proxy is compared with its members (the Gaussians that it replaces).
 const SAMPLED_FRAMES: usize = 16;
 
-/// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of the clusters `all`. They
-/// are the merged state of the cluster at the reference frame, minus the changes (deltas) that the field makes at this
-/// frame to the leader (the most important member of the cluster). `merge` selects whether a proxy is placed at the
-/// mean of its members or at the canonical position of its leader.
+/// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of the clusters `all`. The
+/// parameters are the merged state of the cluster at the reference frame, minus the changes (deltas) that the field
+/// makes at this frame to the leader, the most important member of the cluster. `merge` selects whether a proxy is
+/// placed at the mean of its members or at the canonical position of its leader.
 ///
 /// Two kinds of proxies get other parameters:
 /// - A proxy at the mean may drift away from its members, because the field moves it differently. If the distance
@@ -106,10 +106,10 @@ fn merged_states(
 }
 
 /// Returns `states`, the states of proxies (Gaussians that replace merged clusters) at one frame, with quaternions of
-/// other lengths: each has the length of the quaternion of the proxy's leader (the most important member of the
-/// cluster) at this frame. The length matters because the field adds its delta to the stored quaternion, so the angle
-/// of rotation depends on the length. `of_leaders` holds the stored parameters of the leaders, `deltas` the changes
-/// that the field makes to them at this frame.
+/// other lengths. The quaternion of a proxy gets the length that the quaternion of its leader (the most important
+/// member of the cluster) has at this frame. The length matters because the field adds its delta to the stored
+/// quaternion, so the angle of rotation depends on the length. `of_leaders` holds the stored parameters of the leaders,
+/// `deltas` the changes that the field makes to them at this frame.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);

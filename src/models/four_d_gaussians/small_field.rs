@@ -15,7 +15,8 @@ use crate::files::state_dict::{MAX_EXPANSION, StoredTensor, TensorValues};
 /// heads, the bounding box of the field) take few bytes, and every value of the field depends on them.
 const MIN_HALF_VALUES: usize = 1024;
 /// Maximum root mean square error of a tensor in half precision, as a fraction of the root mean square of the tensor.
-/// Rounding of values within range stays below it; values too large or too small for half precision exceed it.
+/// The rounding of values within the range of half precision stays below it. Values that are too large or too small for
+/// half precision exceed it.
 const MAX_ERROR: f64 = 1.0 / 2048.0;
 
 /// Returns `tensors` with the values that are read back after storage in half precision. Tensors that are not stored in
@@ -30,8 +31,8 @@ pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
 }
 
 /// Returns the tensors of a deformation field in compact form. `from_zero` states that the field is never read at times
-/// below 0. Rows of time planes (feature planes over time) for these times are then never read either, and share the
-/// storage of other rows.
+/// below 0. Then the rows of time planes (feature planes over time) for these times are never read either, and they
+/// share the storage of other rows.
 pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
     let pack = |shares: bool| -> Vec<StoredTensor> {
         let pack = |(name, tensor): (&String, &Tensor)| match shares {

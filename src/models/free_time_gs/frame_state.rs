@@ -24,17 +24,18 @@ use crate::recipe::MergeParams;
 /// [`StoredParams::format_specific`] are described in [`crate::files::ftgs`].
 #[derive(Debug, Clone)]
 pub(in crate::models) struct FreeTime {
-    /// Conversion from the times of frames to the time unit of the stored parameters, in which the clip lasts from 0 to
-    /// 1.
+    /// Conversion from the times of frames to the time unit of the stored parameters. In this unit, the clip lasts from
+    /// 0 to 1.
     pub(in crate::models) clip: ClipTimes,
-    /// Two constants in the standard deviation of a temporal window, in the time unit of the stored parameters: the
-    /// lower limit to which it is raised, and the value that is then added to it.
+    /// Constants `[min, offset]` of the standard deviation in time of a Gaussian, in the time unit of the stored
+    /// parameters. The standard deviation is max(exp(d), min) + offset, where d is the stored duration.
     pub(in crate::models) deviation_floor: [f64; 2],
-    /// Lower limit to which the opacity of every Gaussian is raised at every time.
+    /// Minimum opacity of every Gaussian at every time. Smaller opacities are raised to it.
     pub(in crate::models) min_opacity: f64,
 }
 
-/// Values of some Gaussians that do not depend on time, for computing their temporal windows.
+/// Temporal windows of some Gaussians: values from which the opacity at any time is computed and that do not depend on
+/// time.
 #[derive(Debug)]
 pub(in crate::models) struct Windows {
     /// For each Gaussian 1/(2s²), where s is the standard deviation of its temporal window.
@@ -48,8 +49,8 @@ impl FreeTime {
     pub(in crate::models) const TRAINED: FreeTime =
         FreeTime { clip: ClipTimes::UNIT_INTERVAL, deviation_floor: [0.02, 1e-8], min_opacity: 1e-4 };
 
-    /// Returns the standard deviation s in time of a Gaussian. `duration` is the stored parameter, the logarithm of a
-    /// duration.
+    /// Returns the standard deviation s in time of a Gaussian, in the time unit of the stored parameters. `duration` is
+    /// the stored parameter, a natural logarithm.
     fn deviation(&self, duration: f32) -> f64 {
         f64::from(duration).exp().max(self.deviation_floor[0]) + self.deviation_floor[1]
     }
@@ -64,9 +65,9 @@ impl FreeTime {
         (self.min_opacity / (1.0 - self.min_opacity)).ln()
     }
 
-    /// Returns the stored parameters `raw` with each duration replaced by the logarithm of the standard deviation in
-    /// time that this motion model computes from it. The lower limit is already applied to the result; a reader of the
-    /// result must not apply it again.
+    /// Returns the stored parameters `raw` with each duration replaced by the natural logarithm of the standard
+    /// deviation in time that this motion model computes from it. [`FreeTime::deviation_floor`] is already applied to
+    /// the result; a reader of the result must not apply it again.
     pub(in crate::models) fn with_deviations(&self, raw: &StoredParams) -> StoredParams {
         let mut raw = raw.clone();
         let durations = raw.format_specific.plane_mut(LOG_TIME_DEVIATION).iter_mut();

@@ -19,8 +19,8 @@ use crate::source::FrameSource;
 
 /// Maximum number of frames at which proxies (Gaussians that replace merged ones) are fitted to the merged Gaussians.
 const SAMPLED_FRAMES: usize = 48;
-/// Minimum product of opacity and temporal window that a proxy (Gaussian that replaces merged ones) must have at a
-/// frame; frames with a smaller product are not used for matching.
+/// Minimum product of opacity and temporal window of a proxy (Gaussian that replaces merged ones) at a frame. Frames
+/// with a smaller product are not used to fit the proxy.
 const MIN_VISIBLE: f64 = 1e-4;
 /// Minimum and maximum opacity of a proxy (Gaussian that replaces merged ones). They bound its opacity logit.
 const OPACITY_RANGE: [f64; 2] = [1e-3, 1.0 - 1e-4];
@@ -73,7 +73,7 @@ pub(in crate::models) struct Matched {
     pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
-/// Target state of one proxy (Gaussian that replaces merged ones) at one frame. It is a Gaussian with the mean and
+/// Target state of one proxy (Gaussian that replaces merged ones) at one frame: the Gaussian with the mean and
 /// covariance of the mixture of the merged Gaussians, which is called their moment match.
 pub(in crate::models) struct ProxyAtFrame<'a> {
     /// Index of the cluster (merged Gaussians) that the proxy replaces.
@@ -82,21 +82,20 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) line: &'a LinearPath,
     /// Time stamp of the frame.
     pub(in crate::models) time: f64,
-    /// Weight of this frame in a weighted fit of the proxy's attributes, such as the SH coefficients, over the frames.
-    /// It is a product: the proxy's temporal window at this frame (factor of its opacity that depends on time, 1 at the
-    /// center of the window), times the opacity of the target state.
+    /// Weight m·α of this frame in fits over the frames, such as the fit of the proxy's SH coefficients. m is the value
+    /// of the proxy's temporal window at this frame: a factor of its opacity, 1 at the center of the window. α is the
+    /// opacity of the target state.
     pub(in crate::models) weight: f64,
-    /// Target states of a block of proxies (Gaussians that replace merged ones) at this frame, one row per proxy. Each
-    /// has the mean and covariance of the mixture of the Gaussians that its proxy replaces.
+    /// Target states of a block of proxies (Gaussians that replace merged ones) at this frame, one row per proxy.
     pub(in crate::models) state: &'a Gaussians,
     /// Index in `state` of the row with the target state of this proxy.
     pub(in crate::models) row: usize,
 }
 
 /// Computes the path, temporal window and shape of one proxy (Gaussian that replaces merged ones) for each of
-/// `clusters`. Each model format with linear motion converts them to its own stored parameters. At every sampled frame,
-/// a proxy has a target state: the Gaussian with the mean and covariance of the mixture of its members (the merged
-/// Gaussians). The shape and opacity of the proxy are fitted to its target states.
+/// `clusters`. The caller converts them to the stored parameters of its model format, which must have linear motion. At
+/// every sampled frame, a proxy has a target state: the Gaussian with the mean and covariance of the mixture of its
+/// members (the merged Gaussians). The shape and opacity of the proxy are fitted to its target states.
 ///
 /// - `line_of(id)` returns the path and window of the member `id`.
 /// - `window(line, time)` returns the value of the window of `line` at `time`.
@@ -144,8 +143,8 @@ pub(in crate::models) fn match_proxies(
     Ok(matched)
 }
 
-/// Sums over the sampled frames of one proxy (Gaussian that replaces merged ones), from which its opacity and
-/// covariance are computed. At each frame, m is the value of the proxy's temporal window and α the opacity of its
+/// Sums over the sampled frames for one proxy (Gaussian that replaces merged ones), from which its opacity and
+/// covariance are computed. At each frame, m is the value of the proxy's temporal window, and α is the opacity of its
 /// target state (see [`ProxyAtFrame`]).
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
@@ -172,9 +171,9 @@ impl FrameSums {
         self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
-    /// Returns two averages over the added frames, for a proxy (Gaussian that replaces merged ones): its opacity logit
-    /// at the center of its temporal window, and its covariance (xx, xy, xz, yy, yz, zz). Returns `None` if no frame
-    /// was added.
+    /// Returns the opacity logit at the center of the temporal window, and the covariance (xx, xy, xz, yy, yz, zz), of
+    /// the proxy (Gaussian that replaces merged ones). The opacity is Σ m·α / Σ m², limited to [`OPACITY_RANGE`]. The
+    /// covariance is the mean with the weights m·α. Returns `None` if no frame was added.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
         let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));

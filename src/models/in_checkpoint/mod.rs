@@ -53,7 +53,7 @@ pub(super) trait ProxyRule: MotionModel {
     /// Adds to `hash` the settings that determine the states of Gaussians but are not stored in the checkpoint.
     fn hash_settings(&self, hash: &mut Xxh3);
 
-    /// Returns the motion model to use for frames at `times`; `None` if it does not depend on the times.
+    /// Returns the motion model to use for frames at `times`; `None` if this motion model serves for all times.
     fn for_times(&self, times: &[f64]) -> Option<Self>
     where
         Self: Sized,

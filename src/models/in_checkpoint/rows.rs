@@ -17,7 +17,7 @@ use crate::models::trajectories::state_bytes;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::models) enum RowElement {
     /// Component of an attribute: the attribute, and the index of the component in it.
-    Of(Attributes, usize),
+    Attribute(Attributes, usize),
     /// Parameter with this index in [`StoredParams::format_specific`], which only this model format has.
     Own(usize),
     /// Value that the states of Gaussians do not depend on.
@@ -28,7 +28,7 @@ impl RowElement {
     /// Returns the meaning of `count` consecutive values in a tensor's row: the components of the attribute `column`,
     /// beginning with component `skipped`.
     pub(in crate::models) fn all_of(column: Attributes, skipped: usize, count: usize) -> Vec<RowElement> {
-        (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
+        (skipped..skipped + count).map(|c| RowElement::Attribute(column, c)).collect()
     }
 
     /// Returns the meaning of `count` consecutive values in a tensor's row that are format-specific parameters: value k
@@ -41,7 +41,7 @@ impl RowElement {
     /// [`RowElement::Unread`].
     fn get(self, raw: &StoredParams) -> Option<&[f32]> {
         match self {
-            RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
+            RowElement::Attribute(column, c) => Some(raw.gaussians.column(column).plane(c)),
             RowElement::Own(c) => Some(raw.format_specific.plane(c)),
             RowElement::Unread => None,
         }
@@ -54,7 +54,7 @@ struct Param {
     name: String,
     tensor: TensorView,
     /// Meaning of each value in a row of the tensor, in order. A row holds the values of one Gaussian.
-    planes: Vec<RowElement>,
+    elements: Vec<RowElement>,
 }
 
 /// Tensors of a checkpoint that have one row per Gaussian.
@@ -111,7 +111,7 @@ impl CheckpointReader {
     }
 
     /// Reads the tensor at the node `id` of the checkpoint. `name` names it in error messages. `row` is its expected
-    /// shape without the first axis, which counts the Gaussians. `planes` is the meaning of each value in a row (the
+    /// shape without the first axis, which counts the Gaussians. `elements` is the meaning of each value in a row (the
     /// values of one Gaussian).
     ///
     /// # Errors
@@ -122,7 +122,7 @@ impl CheckpointReader {
         id: NodeId,
         name: &str,
         row: &[usize],
-        planes: Vec<RowElement>,
+        elements: Vec<RowElement>,
     ) -> Result<()> {
         let checkpoint = &self.tensors.checkpoint;
         let tensor = checkpoint.float_tensor(id, name)?;
@@ -131,20 +131,20 @@ impl CheckpointReader {
             return Err(checkpoint.wrong(name, format!("shape {shape:?}"), format!("shape {:?}", tensor.shape)));
         }
         let values = checkpoint.values(&tensor, name)?;
-        let width = planes.len();
-        for (c, plane) in planes.iter().enumerate() {
-            let to = match *plane {
-                RowElement::Of(column, plane) => self.raw.gaussians.column_mut(column).plane_mut(plane),
+        let width = elements.len();
+        for (c, element) in elements.iter().enumerate() {
+            let to = match *element {
+                RowElement::Attribute(column, plane) => self.raw.gaussians.column_mut(column).plane_mut(plane),
                 RowElement::Own(plane) => self.raw.format_specific.plane_mut(plane),
                 RowElement::Unread => continue,
             };
             to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);
-            if *plane == RowElement::Of(Attributes::OPACITY, 0) {
+            if *element == RowElement::Attribute(Attributes::OPACITY, 0) {
                 self.infinite_logits += to.iter().filter(|logit| logit.is_infinite()).count();
                 to.iter_mut().for_each(|logit| *logit = finite_logit(*logit));
             }
         }
-        self.tensors.params.push(Param { name: name.to_owned(), tensor, planes });
+        self.tensors.params.push(Param { name: name.to_owned(), tensor, elements });
         Ok(())
     }
 
@@ -171,7 +171,7 @@ impl RowTensors {
     /// Returns, for every tensor that holds parameters of Gaussians, its name, its node in the checkpoint, and the
     /// meaning of each value of a row (the values of one Gaussian).
     pub(in crate::models) fn params(&self) -> impl Iterator<Item = (&str, NodeId, &[RowElement])> {
-        self.params.iter().map(|param| (&*param.name, param.tensor.id, &param.planes[..]))
+        self.params.iter().map(|param| (&*param.name, param.tensor.id, &param.elements[..]))
     }
 
     /// Returns the checkpoint nodes of the tensors that only the training reads. Each of these tensors has one row per
@@ -181,9 +181,9 @@ impl RowTensors {
     }
 
     /// Writes the checkpoint of the compressed model `reduction` to `path`. `before` holds the parameters of the
-    /// original Gaussians, `raw_left` those of the Gaussians in `reduction`. The row of a Gaussian is copied byte for
-    /// byte if its parameters are unchanged. In tensors that only the training reads, the rows of proxies (Gaussians
-    /// that replace merged ones) become zero.
+    /// original Gaussians, `raw_left` the parameters of the Gaussians of `reduction`. The row of a Gaussian is copied
+    /// byte for byte if its parameters are unchanged. In tensors that only the training reads, the rows of proxies
+    /// (Gaussians that replace merged ones) become zero.
     ///
     /// # Errors
     /// Fails if a tensor cannot be read or a write fails.
@@ -195,8 +195,8 @@ impl RowTensors {
         path: &Path,
     ) -> Result<()> {
         let mut rows = Vec::new();
-        for Param { name, tensor, planes } in &self.params {
-            let pairs: Vec<_> = planes.iter().map(|plane| plane.get(raw_left).zip(plane.get(before))).collect();
+        for Param { name, tensor, elements } in &self.params {
+            let pairs: Vec<_> = elements.iter().map(|element| element.get(raw_left).zip(element.get(before))).collect();
             let differs = |place: usize, row: u32| {
                 pairs
                     .iter()
@@ -208,11 +208,11 @@ impl RowTensors {
                 .filter(|&(place, &row)| differs(place as usize, row))
                 .map(|(place, _)| place)
                 .collect();
-            let unread = planes.contains(&RowElement::Unread) && !changed.is_empty();
+            let unread = elements.contains(&RowElement::Unread) && !changed.is_empty();
             let stored = if unread { self.checkpoint.values(tensor, name)? } else { Vec::new() };
-            let mut values = Vec::with_capacity(changed.len() * planes.len());
+            let mut values = Vec::with_capacity(changed.len() * elements.len());
             for &place in &changed {
-                let row = reduction.kept[place as usize] as usize * planes.len();
+                let row = reduction.kept[place as usize] as usize * elements.len();
                 values.extend(pairs.iter().enumerate().map(|(c, pair)| match pair {
                     Some((raw_left, _)) => raw_left[place as usize],
                     None => stored[row + c],

@@ -125,8 +125,8 @@ impl LinkedFrames {
         let (source, info) = (input.source(), input.source().info());
         let visible_rows = count_visible_rows(source)?;
         let state = state_bytes(info.sh_degree, Attributes::all());
-        let residence = input.memory_profile();
-        let tile = residence.gaussian_block.min(info.count as u64) * residence.frame_block;
+        let profile = input.memory_profile();
+        let tile = profile.gaussian_block.min(info.count as u64) * profile.frame_block;
         let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Attributes::SH));
         let unpacked = TOGETHER_BYTES.min(state * visible_rows.iter().sum::<u64>());
         let mut received =

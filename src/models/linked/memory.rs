@@ -10,8 +10,8 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::render::{BYTES_PER_VISIBLE, STRIP_BYTES};
 use crate::tracking::{Joiner, Linker};
 
-/// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time; a single frame may be
-/// larger.
+/// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time. A single frame may be
+/// larger than this.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
 /// Bytes of memory that each Gaussian of a frame takes in two lists. The first list holds its track (Gaussian followed
 /// through frames) and its row number in the file of the frame; the second is a sorted copy of the first.
@@ -72,10 +72,10 @@ impl Sizes {
         (8 + 4 + size_of::<Attributes>() as u64) * self.linked
     }
 
-    /// Returns the bytes of memory that linking frames into tracks (Gaussians followed through frames) takes. It is the
-    /// sum of:
-    /// - the largest frame: its file, its attributes, and the values that are compared to link it
-    /// - for each track that may continue in the next frame: the values with which that frame is compared
+    /// Returns the bytes of memory that linking frames into tracks (Gaussians followed through frames) takes. They are
+    /// the sum of:
+    /// - the largest frame: its file, its attributes, and the values by which it is linked to the tracks
+    /// - for each track that may continue in the next frame: the values with which the next frame is compared
     /// - for each track: its first frame and row, and lists for joining tracks
     fn linking(&self) -> u64 {
         let of_frame = self.file() + self.state() + Linker::BYTES_PER_GAUSSIAN as u64 + BYTES_PER_ROW;

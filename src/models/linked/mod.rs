@@ -3,10 +3,10 @@
 //!
 //! Every frame is read twice: once to link its Gaussians, once to pack the tracks. Tracks that seem to be the same
 //! Gaussian are joined if renders with joined tracks reach at least 40 dB PSNR against renders with separate tracks.
-//! Otherwise only the most similar tracks are joined. In frames where a track is absent, it keeps its previous state
-//! (or its first one before it begins) with an opacity of nearly zero, so that it is invisible and costs almost no
-//! bytes. Then colors, scales, rotations and opacities that hardly change along a track are replaced by their mean
-//! ([`steady`]), if renders again reach at least 40 dB PSNR.
+//! Otherwise only the most similar tracks are joined, on the same condition. In frames where a track is absent, it
+//! keeps its previous state (or its first one before it begins) with an opacity of nearly zero, so that it is invisible
+//! and costs almost no bytes. Then colors, scales, rotations and opacities that hardly change along a track are
+//! replaced by their mean ([`steady`]), if renders again reach at least 40 dB PSNR.
 //!
 //! Memory: [`Sizes`](memory::Sizes). Two frames while linking; one per thread and a few rendered ones while joining
 //! tracks and computing means; up to 128 MiB while packing. Disk space, in unnamed files beside the container: 4 bytes

@@ -21,8 +21,8 @@ const MIN_PSNR_DB: f64 = 40.0;
 /// Number of virtual cameras from which each sampled frame is rendered, to compare renders before and after a change of
 /// the tracks.
 const VIEWS: usize = 3;
-/// Maximum deviations of an attribute from its mean along a track (Gaussian followed through frames). An attribute that
-/// deviates less becomes constant.
+/// Maximum root mean square deviations of an attribute from its mean along a track (Gaussian followed through frames).
+/// An attribute that deviates less becomes constant.
 /// - `color` limits colors, which range from 0 to 1.
 /// - `other` limits natural logarithms of scales, rotations in radians, and opacities.
 ///
@@ -33,7 +33,7 @@ const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { c
 /// Joins those of `tracks` (Gaussians followed through frames) that seem to be the same Gaussian. `joiner` proposes two
 /// ways to join them. The proposals are tried in order, and the first one with which renders reach [`MIN_PSNR_DB`] is
 /// kept; if there is none, no tracks are joined. `linker` is the linker that made the tracks. Returns a note for the
-/// user if a proposal joins any tracks.
+/// user that says whether tracks were joined; `None` if neither proposal joins any tracks.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -73,7 +73,7 @@ pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<O
         // Tracks are numbered in the order of their first frames, so none of the range begins earlier.
         let sums = |range: Range<usize>| sums(tracks, first[range.start].frame as usize, range);
         let steady = Steady::from_sums(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
-        let parts = steady.parts();
+        let parts = steady.fractions();
         if parts == [0.0; 4] {
             return Ok(None);
         }

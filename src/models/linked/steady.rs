@@ -82,8 +82,8 @@ impl Steady {
     }
 
     /// Returns the fraction of all tracks (Gaussians followed through frames) whose colors are constant, then the
-    /// fractions with constant scales, constant rotations and constant opacities.
-    pub(super) fn parts(&self) -> [f64; 4] {
+    /// fractions of tracks with constant scales, with constant rotations and with constant opacities.
+    pub(super) fn fractions(&self) -> [f64; 4] {
         [Attributes::SH, Attributes::LOG_SCALE, Attributes::ROTATION, Attributes::OPACITY].map(|column| {
             let held = self.columns.iter().filter(|columns| columns.contains(column)).count();
             held as f64 / self.columns.len().max(1) as f64
@@ -120,9 +120,9 @@ impl Steady {
 }
 
 impl HeldMeans {
-    /// Writes the values of constant attributes to `state`. Each pair in `places` is the position of a track (Gaussian
-    /// followed through frames) in the list that was given to [`Steady::means`], and the row of `state` that holds this
-    /// track.
+    /// Writes the values of constant attributes to rows of `state`. A pair (i, row) of `places` states that this row of
+    /// `state` holds the track (Gaussian followed through frames) at index i of the list that was given to
+    /// [`Steady::means`].
     pub(super) fn write_to(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
         for column in STEADY_COLUMNS.iter() {
@@ -155,8 +155,8 @@ pub(super) struct TrackSums {
     /// For each track (Gaussian followed through frames) and color channel: sum over frames of α·Σₖ vₖ², where α is the
     /// opacity and vₖ are the SH coefficients.
     colors: Vec<[f64; 3]>,
-    /// First quaternion of each track (Gaussian followed through frames). A later quaternion q is replaced by −q if
-    /// that is nearer to the first one.
+    /// First quaternion of each track (Gaussian followed through frames). A later quaternion q is replaced by −q if −q
+    /// is nearer to the first one.
     first: Vec<[f32; 4]>,
 }
 

@@ -62,7 +62,8 @@ pub(super) struct LinkedTracks {
     starts: Vec<u64>,
 }
 
-/// Number of frames in which each track (Gaussian followed through frames) is present, and frames that need blending.
+/// Number of frames in which each track (Gaussian followed through frames) is present, and the frames in which several
+/// Gaussians of one track have to be blended.
 pub(super) struct TrackLengths {
     /// Number of frames in which each track (Gaussian followed through frames) is present, by index of the track.
     frames_per_track: Vec<u32>,
@@ -293,7 +294,8 @@ impl LinkedTracks {
 
     /// Reads the Gaussians `rows`, which are sorted by track, from `file`, the file of a frame. Row i of `state`
     /// receives the Gaussian `rows[i]`. If a track (Gaussian followed through frames) has several Gaussians in the
-    /// frame, they are blended into the first of these rows. Returns for each track the index of its first row.
+    /// frame, they are blended into the first of these rows. Returns for each track the index in `rows` of its first
+    /// Gaussian.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -331,8 +333,8 @@ impl LinkedTracks {
 
     /// Writes the states of all tracks (Gaussians followed through frames) at all frames to the container `path`.
     /// Tracks are in the order of their first frames, so tracks with neighboring indices are often absent from the same
-    /// frames. If all tracks of a block are absent from several successive blocks of frames, they are encoded only for
-    /// the first of these.
+    /// frames. If all tracks of a block of tracks are absent from several successive blocks of frames, they are encoded
+    /// only for the first of these blocks.
     pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());

@@ -266,7 +266,7 @@ impl<L: MotionModel> PreparedBlock<L> {
     }
 }
 
-/// Reader of some Gaussians of a model, frame by frame; it works in blocks of Gaussians.
+/// Reader of some Gaussians of a model, frame by frame. It computes their states a block of Gaussians at a time.
 struct MotionModelReader<'a, L: MotionModel> {
     model: &'a MotionModelFrames<L>,
     blocks: Vec<PreparedBlock<L>>,

@@ -25,7 +25,8 @@ pub(in crate::models) fn faded_logit(inverse_odds: f64, exponent: f64) -> f64 {
     if logit < -MAX_LOGIT { -MAX_LOGIT } else { logit }
 }
 
-/// Returns the derivative of [`faded_logit`] with respect to the stored logit o; 0 where the result is clamped.
+/// Returns the derivative of [`faded_logit`] with respect to the stored logit o; 0 if the result of `faded_logit` is
+/// clamped.
 pub(in crate::models) fn slope(inverse_odds: f64, exponent: f64) -> f64 {
     let logit = faded_logit(inverse_odds, exponent);
     if logit.abs() < MAX_LOGIT { inverse_odds / (inverse_odds - exponent.exp_m1()) } else { 0.0 }

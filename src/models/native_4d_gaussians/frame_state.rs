@@ -1,6 +1,6 @@
 //! Motion model of four-dimensional Gaussians: the state at a time is a slice of the Gaussian at that time.
 //!
-//! A Gaussian has the center x, μ in space and time, and a covariance Σ₄ with the blocks Σ₁₁ (space), Σ_tt (time) and
+//! A Gaussian has the center (x, μ) in space and time, and a covariance Σ₄ with the blocks Σ₁₁ (space), Σ_tt (time) and
 //! Σ₁₂ (both).
 //!
 //! - Σ₄ = R₄ diag(s)² R₄ᵀ; velocity v = Σ₁₂/Σ_tt; x(t) = x + v·(t − μ); the spatial covariance Σ = Σ₁₁ − Σ₁₂Σ₂₁/Σ_tt is
@@ -43,8 +43,8 @@ pub(super) struct Native {
     /// Whether the rows and columns of the 4D rotation matrix are in reversed order, as in checkpoints since 15
     /// September 2024.
     pub(super) flipped: bool,
-    /// Variance that is added to the temporal variance Σ_tt of a Gaussian when its temporal marginal (factor of the
-    /// opacity) is computed.
+    /// Variance p that is added to the temporal variance Σ_tt of a Gaussian when its temporal marginal (factor of the
+    /// opacity) is computed: exp(−½(t − μ)²/(Σ_tt + p)). A negative value counts as 0.
     pub(super) prefilter: f64,
     /// Number of time-dependent SH terms in use, from 0 to 2.
     pub(super) terms: usize,
@@ -102,8 +102,8 @@ impl Native {
         Slice { velocity, variance, covariance: Some(covariance) }
     }
 
-    /// Returns −1/(2 (Σ_tt + p)) for the variance in time Σ_tt = `variance` and the constant p = `prefilter` (0 if
-    /// negative).
+    /// Returns −1/(2(Σ_tt + p)), where Σ_tt = `variance` is the variance in time, and p is [`Native::prefilter`], or 0
+    /// if it is negative.
     fn rate(&self, variance: f64) -> f64 {
         -0.5 / (variance + self.prefilter.max(0.0))
     }

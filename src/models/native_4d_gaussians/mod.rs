@@ -73,7 +73,7 @@ fn checkpoints(folder: &Path) -> Vec<PathBuf> {
 }
 
 /// Returns whether the checkpoint at `path` is a pair: a capture tuple (the saved training state) and an iteration
-/// number. The number of values in the tuple must be one of `lengths`.
+/// number. The number of values in the capture tuple must be one of `lengths`.
 fn has_capture(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
@@ -108,9 +108,8 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
     }
 }
 
-/// Returns the SH degree and the number of stored time-dependent SH terms of a model that stores `coefficients` SH
-/// coefficients per channel; `None` if no model has this number. `is_4d` states that it is a 4D model, not a static
-/// one.
+/// Returns the SH degree and the number of stored time-dependent SH terms of a model with `coefficients` SH
+/// coefficients per channel; `None` if no model has this number. `is_4d` states that the model is 4D, not static.
 fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
     match (coefficients, is_4d) {
         (1 | 4 | 9 | 16, _) => Some((coefficients.isqrt() - 1, 0)),
@@ -122,8 +121,8 @@ fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
 }
 
 /// Creates the motion model of a 4D model from the values `parts` of its capture tuple, the training state in the
-/// checkpoint. `stored_terms` is the number of time-dependent SH terms that the model stores; at most so many are used.
-/// Fails if a value has the wrong type.
+/// checkpoint. `stored_terms` is the number of time-dependent SH terms that the model stores; the motion model uses at
+/// most that many. Fails if a value has the wrong type.
 fn motion_model(
     checkpoint: &Checkpoint,
     parts: &[NodeId],

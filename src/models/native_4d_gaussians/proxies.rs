@@ -6,8 +6,8 @@
 //!
 //! SH coefficients refer to the proxy's own center in time. They are fitted to the SH coefficients of the moment
 //! matches at the sampled frames (a moment match is the Gaussian with the mean and covariance of the merged Gaussians).
-//! The fit is by the functions 1, a cosine wave and the wave of twice its frequency (least squares, with a ridge term
-//! on the waves).
+//! Each coefficient is fitted by the sum of three functions of time: a constant, a cosine wave, and a cosine wave of
+//! twice its frequency. The fit is by least squares, with a ridge term on the waves.
 
 use super::frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
@@ -92,18 +92,18 @@ pub(super) fn propose(
 /// Least-squares fit of many values by the same three functions of time: the constant 1 and two waves.
 #[derive(Debug, Clone, Default)]
 struct ThreeFunctionFit {
-    /// Matrix of the normal equations: for each pair of basis functions of time (the constant 1 and two cosine waves),
-    /// the weighted sum of their products over the samples.
+    /// Matrix of the normal equations: entry [i][j] is Σ w·fᵢ·fⱼ over the samples, where w is the weight of a sample
+    /// and f₀, f₁, f₂ are the basis functions of time (the constant 1 and two cosine waves).
     normal: [[f64; 3]; 3],
-    /// Right-hand sides of the normal equations: for each fitted value and each of the three basis functions of time,
-    /// the weighted sum of their products over the samples.
+    /// Right-hand sides of the normal equations, for each fitted value v: entry [i] is Σ w·fᵢ·v over the samples, with
+    /// the weights w and the basis functions fᵢ of `normal`.
     by_value: Vec<[f64; 3]>,
 }
 
 impl ThreeFunctionFit {
-    /// Adds one sample of all fitted values to the least-squares sums. `basis` holds the three basis functions
-    /// (constant and two cosine waves) at the time of the sample, `values` the values at this time, `weight` the weight
-    /// of the sample.
+    /// Adds one sample of all fitted values to the sums. `basis` holds the three basis functions (constant and two
+    /// cosine waves) at the time of the sample, `values` the values at this time, and `weight` the weight of the
+    /// sample.
     fn add(&mut self, weight: f64, basis: [f64; 3], values: impl ExactSizeIterator<Item = f64>) {
         self.by_value.resize(values.len(), [0.0; 3]);
         for (i, row) in self.normal.iter_mut().enumerate() {
@@ -114,9 +114,8 @@ impl ThreeFunctionFit {
         }
     }
 
-    /// Returns for each fitted value (one SH coefficient of one color channel over time) its three least-squares
-    /// coefficients: of the constant, the first and the second cosine wave. Only the first `terms` waves are fitted;
-    /// the coefficients of the others are 0.
+    /// Returns the three least-squares coefficients of each fitted value: of the constant, of the first and of the
+    /// second cosine wave. Only the first `terms` waves are fitted; the coefficients of the others are 0.
     fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
         let mut normal = self.normal;
         let ridge = RIDGE * normal[0][0];

@@ -134,10 +134,10 @@ fn rule() -> crate::recipe::MergeParams {
     Recipe::preset("default").unwrap().merge
 }
 
-/// Checks row `row` of `state`, the state at `time`, against an independent computation from `parameters`. The spatial
-/// covariance at a time is the inverse of the spatial block of the inverse of Σ₄. The rotation is computed by applying
-/// the quaternions to each axis. `flipped` states that the order of rows and columns of the rotation matrix is
-/// reversed.
+/// Checks row `row` of `state`, the state at `time`, against an independent computation from `parameters`. In this
+/// computation, the spatial covariance at a time is the inverse of the spatial block of the inverse of Σ₄, and the
+/// rotation is found by applying the quaternions to each axis. `flipped` states that the order of rows and columns of
+/// the rotation matrix is reversed.
 fn check(parameters: &[(usize, PickledTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
     let values = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
     let unit = |q: Vec<f64>| DVec4::from_slice(&q).normalize().to_array();

@@ -174,8 +174,8 @@ impl CachedNodes {
         if self.has_mask { opacity(raw.format_specific.plane(self.nodes.features())[row]) } else { 1.0 }
     }
 
-    /// Returns the network's output for all control nodes at `time`. The output is the same for all blocks of
-    /// Gaussians, so it is cached. Two threads that compute the same time get equal values.
+    /// Returns the network's output for all control nodes at `time`. All blocks of Gaussians use the same output, so it
+    /// is cached. Two threads that compute the output for the same time get equal values.
     fn motion(&self, network: &Network, time: f64) -> Result<Arc<PredictedMotion>> {
         let key = (time as f32).to_bits();
         let cache = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
@@ -195,7 +195,7 @@ impl CachedNodes {
         Ok(motion)
     }
 
-    /// Returns the maximum number of points in time for which network outputs are cached.
+    /// Returns the maximum number of times for which network outputs are cached.
     fn max_cached(&self) -> usize {
         (MAX_CACHE_BYTES / (4 * 14 * self.nodes.len())).max(2)
     }
@@ -215,8 +215,8 @@ fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> Attrib
 }
 
 impl NodeMotion {
-    /// Returns the network's outputs at `time` for the block of Gaussians from which `prepared` was computed: only
-    /// those outputs on which the attributes `want` depend.
+    /// Returns the network's outputs at `time` for the block of Gaussians from which `prepared` was computed. Computes
+    /// only the outputs on which the attributes `want` depend.
     fn motion(&self, time: f64, prepared: &PreparedNodes, want: Attributes) -> Result<PredictedMotion> {
         let (mut motion, want) = (PredictedMotion::default(), want & self.network.deformed_attributes());
         match (prepared, &self.nodes) {
@@ -283,8 +283,8 @@ impl MotionModel for NodeMotion {
         for column in want.iter() {
             let to = out.column_mut(column);
             match column {
-                Attributes::POSITION => add(&motion.warp, to),
-                Attributes::ROTATION => add(&motion.rotation, to),
+                Attributes::POSITION => add_planes(&motion.warp, to),
+                Attributes::ROTATION => add_planes(&motion.rotation, to),
                 Attributes::LOG_SCALE => each(&motion.scaling, to, |log, by| {
                     let log = f64::from(log);
                     let log = if log > MAX_LOG_SCALE { MAX_LOG_SCALE } else { log };
@@ -292,7 +292,7 @@ impl MotionModel for NodeMotion {
                     ln((exp(log) + f64::from(by)).abs().max(MIN_SCALE)) as f32
                 }),
                 Attributes::OPACITY => each(&motion.opacity, to, |logit, by| add_to_opacity(logit, by) as f32),
-                _ => add(&motion.color, to),
+                _ => add_planes(&motion.color, to),
             }
         }
         Ok(())
@@ -336,8 +336,8 @@ impl MotionModel for NodeMotion {
     }
 }
 
-/// Adds each component (plane) of `by` to the same component of `to`. Does nothing if `by` is empty.
-fn add(by: &AttributeValues, to: &mut AttributeValues) {
+/// Adds each plane of `by` (one component of all Gaussians) to the same plane of `to`. Does nothing if `by` is empty.
+fn add_planes(by: &AttributeValues, to: &mut AttributeValues) {
     each(by, to, |value, by| value + by);
 }
 
@@ -357,8 +357,9 @@ fn add_to_opacity(stored: f32, by: f32) -> f64 {
 }
 
 /// Returns the derivatives of the positions of the Gaussians `raw` at `time` with respect to their stored positions,
-/// for a model whose Gaussians follow the control nodes `sparse`. They include the change of the node weights with the
-/// position. Component 3i + k of a row is the derivative of coordinate i with respect to stored coordinate k.
+/// for a model whose Gaussians follow the control nodes `sparse`. The derivatives include the change of the node
+/// weights with the position. Component 3i + k of a row is the derivative of coordinate i with respect to stored
+/// coordinate k.
 fn position_slopes(sparse: &CachedNodes, network: &Network, raw: &StoredParams, time: f64) -> Result<AttributeValues> {
     let motion = sparse.motion(network, time)?;
     let (mut out, mut shares) = (AttributeValues::zeros(9, raw.len()), Vec::new());

@@ -35,7 +35,7 @@ pub(super) struct Share {
     pub(super) node: u32,
     /// Weight of the control node, between 0 and 1; the weights of all nodes of a Gaussian sum to 1.
     pub(super) weight: f64,
-    /// Weight of the control node before 1e-7 is added and before normalization.
+    /// Kernel of the control node: exp(−d²/(2r²))·σ(weight), from which the normalized weight is computed.
     kernel: f64,
 }
 

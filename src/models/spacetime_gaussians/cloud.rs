@@ -7,7 +7,7 @@
 use std::path::Path;
 
 use super::decoder::ColorActivation;
-use super::frame_state::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
+use super::frame_state::{FEATURES, FULL_PARAM_COUNT, MOTION, OMEGA, SHARED_PARAM_COUNT};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply::write::{put, rows_of_model, value, write_rows_like};
@@ -72,7 +72,7 @@ impl PointCloudFile {
 
     /// Returns whether the file belongs to the full model (with features and a decoder network), not to the lite model.
     pub(super) fn is_full(&self) -> bool {
-        self.own.len() == FULL_WIDTH
+        self.own.len() == FULL_PARAM_COUNT
     }
 
     /// Reads the parameters of all Gaussians. `activation` turns the first three features of the full model into
@@ -127,9 +127,9 @@ impl PointCloudFile {
         }
     }
 
-    /// Writes the compressed model to a PLY file with the same properties. Rows are copied byte for byte, except that
-    /// proxies (Gaussians that replace merged ones) are written in place of their leaders (the most important members
-    /// of the clusters), and parameter deltas are added.
+    /// Writes the compressed model to a PLY file with the same properties. Rows of unchanged Gaussians are copied byte
+    /// for byte. Proxies (Gaussians that replace merged ones) are written in place of their leaders (the most important
+    /// members of the clusters), and parameter deltas are added to the stored values.
     ///
     /// # Errors
     /// Fails if the file was cut short since it was opened or a write fails.
@@ -188,16 +188,16 @@ impl PointCloudFile {
 fn own_property_names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
     let mut names: Vec<String> = vec![MARKER_PROPERTY.to_owned(), "trbf_scale".to_owned()];
-    names.extend(numbered("motion", OMEGA - MOTION).chain(numbered("omega", WIDTH - OMEGA)));
+    names.extend(numbered("motion", OMEGA - MOTION).chain(numbered("omega", SHARED_PARAM_COUNT - OMEGA)));
     if is_full {
         names.extend(numbered("f_dc", 6).chain(numbered("f_t", 3)));
     }
     names
 }
 
-/// Sets the colors in `raw` as SH coefficients of degree 0. There are two cases:
-/// - Full model (`activation` given): a color is `activation` applied to the first three features of the Gaussian.
-/// - Lite model (`None`): `raw` holds the stored colors in place of SH coefficients, and they are converted.
+/// Sets the colors in `raw`, as SH coefficients of degree 0. There are two cases:
+/// - Full model (`activation` is given): a color is `activation` applied to the first three features of the Gaussian.
+/// - Lite model (`None`): `raw` holds the stored colors in place of SH coefficients, and the function converts them.
 fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
         let features = raw.format_specific.width() > FEATURES;

@@ -7,10 +7,10 @@ use crate::models::trajectories::state_bytes;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 
-/// Returns how much memory an open model takes, and how much time and memory reading it takes. `width` is the number of
-/// its format-specific parameters per Gaussian.
-pub(super) fn residence(width: usize) -> MemoryProfile {
-    let whole = state_bytes(0, Attributes::all()) + 4 * width as u64;
+/// Returns how much memory an open model takes, and how much time and memory reading it takes. `param_count` is the
+/// number of its format-specific parameters per Gaussian.
+pub(super) fn memory_profile(param_count: usize) -> MemoryProfile {
+    let whole = state_bytes(0, Attributes::all()) + 4 * param_count as u64;
     MemoryProfile {
         per_gaussian: whole,
         opening: whole,

@@ -16,7 +16,7 @@ const INPUTS: usize = 12;
 /// Number of units in the hidden layer of the network.
 const HIDDEN: usize = 6;
 
-/// Last step of the computation of a color: function that is applied to each of its three values.
+/// Last step of the computation of a pixel color: the function that is applied to each of its three channels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ColorActivation {
     /// Logistic function, 1/(1 + exp(−x)).
@@ -30,7 +30,7 @@ pub(super) enum ColorActivation {
 impl ColorActivation {
     /// Returns the function that `cfg_args` selects by the value `name` of its key `rgbfunction`; `None` for unknown
     /// names.
-    pub(super) fn named(name: &str) -> Option<ColorActivation> {
+    pub(super) fn from_name(name: &str) -> Option<ColorActivation> {
         match name {
             "sandwich" => Some(ColorActivation::Sigmoid),
             "sandwichnoact" => Some(ColorActivation::Clamp),

@@ -21,14 +21,15 @@ pub(super) const MOTION: usize = 2;
 /// First of four indices in [`StoredParams::format_specific`]: change of the quaternion per unit of time.
 pub(super) const OMEGA: usize = 11;
 /// Number of parameters in [`StoredParams::format_specific`] that both the lite and the full model have.
-pub(super) const WIDTH: usize = 15;
+pub(super) const SHARED_PARAM_COUNT: usize = 15;
 /// First of six indices in [`StoredParams::format_specific`] of the full model: features that are constant in time. The
 /// first three are a color before the last function ([`ColorActivation`](super::decoder::ColorActivation)) is applied.
 pub(super) const FEATURES: usize = 15;
-/// First of three indices in [`StoredParams::format_specific`] of the full model: features per unit of time.
+/// First of three indices in [`StoredParams::format_specific`] of the full model: factors of dt, which give the
+/// features that are proportional to the time dt since the center of the temporal window.
 pub(super) const FEATURES_IN_TIME: usize = 21;
 /// Number of parameters in [`StoredParams::format_specific`] of the full model.
-pub(super) const FULL_WIDTH: usize = 24;
+pub(super) const FULL_PARAM_COUNT: usize = 24;
 
 impl SpacetimeMotion {
     /// Returns the motion and temporal window of the Gaussian in row `row` of `raw`.
@@ -58,8 +59,8 @@ impl SpacetimeMotion {
     }
 }
 
-/// Motion model of the lite and the full SpacetimeGaussians model. The colors of the full model are those in
-/// [`StoredParams::gaussians`], computed without the network.
+/// Motion model of the lite and the full SpacetimeGaussians model. Colors are those in [`StoredParams::gaussians`]; for
+/// the full model, they were computed without the network.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Spacetime {
     /// Whether this is the full model, where a network computes pixel colors from features.
@@ -186,7 +187,7 @@ impl Shading for Spacetime {
         for plane in 0..FEATURES_IN_TIME - FEATURES {
             found.plane_mut(plane).copy_from_slice(raw.format_specific.plane(FEATURES + plane));
         }
-        for c in 0..FULL_WIDTH - FEATURES_IN_TIME {
+        for c in 0..FULL_PARAM_COUNT - FEATURES_IN_TIME {
             let by_time = raw.format_specific.plane(FEATURES_IN_TIME + c);
             for (row, to) in found.plane_mut(FEATURES_IN_TIME - FEATURES + c).iter_mut().enumerate() {
                 *to = ((time - f64::from(centers[row])) * f64::from(by_time[row])) as f32;

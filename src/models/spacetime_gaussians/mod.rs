@@ -42,9 +42,9 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 use cloud::{MARKER_PROPERTY, PointCloudFile};
-use common::{check_kind, residence};
+use common::{check_kind, memory_profile};
 use decoder::{ColorActivation, ColorDecoder};
-use frame_state::{FULL_WIDTH, Spacetime, WIDTH};
+use frame_state::{FULL_PARAM_COUNT, SHARED_PARAM_COUNT, Spacetime};
 pub(super) use splatv::SPLATV;
 
 /// Name of the folder that holds the folders `iteration_K`.
@@ -116,7 +116,7 @@ impl Files {
 struct SpacetimeConfig {
     source_path: Option<String>,
     rgb_function: Option<String>,
-    /// Number of frames that the time span from 0 to 1 stands for.
+    /// Number n of training frames (key `duration`). Frame i, counted from 0, has the time i/n.
     duration: Option<usize>,
 }
 
@@ -171,7 +171,7 @@ impl SpacetimeGaussians {
                 );
                 ColorActivation::Sigmoid
             }
-            Some(name) => ColorActivation::named(name).ok_or_else(|| {
+            Some(name) => ColorActivation::from_name(name).ok_or_else(|| {
                 let expected = "sandwich, sandwichnoact or sandwichnoactss, for a model with nine features";
                 Error::input(&path.join(CFG_ARGS), "key rgbfunction", expected, quoted(name).to_string())
             })?,
@@ -277,7 +277,7 @@ impl InputModel for SpacetimeGaussians {
     }
 
     fn memory_profile(&self) -> MemoryProfile {
-        residence(if self.cloud.is_full() { FULL_WIDTH } else { WIDTH })
+        memory_profile(if self.cloud.is_full() { FULL_PARAM_COUNT } else { SHARED_PARAM_COUNT })
     }
 
     fn timing(&self) -> TimeOrigin {

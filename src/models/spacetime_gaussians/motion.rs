@@ -41,8 +41,8 @@ impl SpacetimeMotion {
         (-dt * dt).exp()
     }
 
-    /// Returns the same motion, expressed by coefficients around another `center`. The positions and the directions of
-    /// the quaternions at each time stay the same up to rounding, but the temporal window is moved to the new center.
+    /// Returns the same motion, expressed by coefficients around another `center`. At each time, the position and the
+    /// direction of the quaternion stay the same up to rounding. The temporal window, however, moves to the new center.
     /// `rotation` is normalized if it is not zero.
     pub(super) fn recentered(&self, center: f64) -> SpacetimeMotion {
         let (by, [_, p1, p2, p3]) = (center - self.center, self.path);
@@ -77,8 +77,9 @@ pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Returns the center and the log width of the temporal window into which the windows of `members` are merged. It has
-/// the same first and second moments in time as their weighted sum. Each member is a weight and a motion.
+/// Returns the center and the log width of the temporal window into which the windows of `members` are merged. The
+/// merged window has the mean and the variance in time of the weighted sum of the members' windows. Each member is a
+/// weight and a motion.
 pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     // Each window counts with its area in time, relative to the widest one, so that no area overflows.
     let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));
@@ -96,9 +97,9 @@ pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
 }
 
 /// Returns the weighted mean of motions that have the same center; `None` if `members` is empty. Each member is a
-/// weight and a motion. The state of the mean at any time is the weighted mean of the states of all `members`. Before
-/// the mean is taken, each quaternion gets the sign that brings it nearer to the quaternion of the member with the
-/// largest weight.
+/// weight and a motion. At any time, the position and the quaternion of the mean are the weighted means of the
+/// positions and quaternions of all `members`. Before the mean is taken, each quaternion gets the sign that brings it
+/// nearer to the quaternion of the member with the largest weight. The temporal window is that of this member.
 pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion> {
     let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
     let (mut path, mut rotation, mut omega) = ([[0.0; 3]; 4], [0.0; 4], [0.0; 4]);

@@ -11,7 +11,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::decoder::ColorActivation;
-use super::frame_state::{FEATURES, FULL_WIDTH, Spacetime, WIDTH};
+use super::frame_state::{FEATURES, FULL_PARAM_COUNT, SHARED_PARAM_COUNT, Spacetime};
 use super::motion::{SpacetimeMotion, TargetState, dot, fitted, mean, merged_window, product};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -23,15 +23,16 @@ use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
 /// Maximum ratio between the widths of the temporal windows of a proxy (Gaussian that replaces merged ones) and of a
-/// member (merged Gaussian). With a larger ratio, or with centers further apart than half of the width of the proxy's
-/// window, the windows count as different.
+/// member (merged Gaussian) that count as similar. The windows count as different if the ratio is larger, or if their
+/// centers are further apart than half of the width of the proxy's window.
 const MAX_WIDTH_RATIO: f64 = 1.5;
 /// Minimum value of a temporal window, whose maximum is 1. Times at which its value is smaller are ignored.
 const MIN_WINDOW: f64 = 0.05;
 /// Maximum number of points in time at which shape and opacity of a proxy (Gaussian that replaces merged ones) are
 /// compared with those of the merged Gaussians.
 const SAMPLED_TIMES: usize = 12;
-/// Minimum difference of the opacity of a proxy (Gaussian that replaces merged ones) from 0 and from 1.
+/// Minimum distance of the opacity of a proxy (Gaussian that replaces merged ones) from 0 and from 1, so that its logit
+/// is finite.
 const OPACITY_MARGIN: f64 = 1e-6;
 
 /// Computes the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`.
@@ -129,7 +130,7 @@ fn proxy_parameters(
         out.gaussians.sh.plane_mut(c)[0] = average(&members, plane) as f32;
     }
     if model.motion_model().is_full {
-        for plane in WIDTH..FULL_WIDTH {
+        for plane in SHARED_PARAM_COUNT..FULL_PARAM_COUNT {
             out.format_specific.plane_mut(plane)[0] =
                 average(&members, members.raw.format_specific.plane(plane)) as f32;
         }
@@ -158,9 +159,10 @@ fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -
 }
 
 /// Returns the states that a proxy (Gaussian that replaces `members`) should approximate, one per frame. A state is the
-/// mean of the members' states, weighted by their weights in the proxy times the values of their temporal windows.
-/// `recentered` holds for each member its weight, and its motion expressed around the center of the proxy. Each
-/// quaternion gets the sign that brings it nearest to the quaternion of the motion `mean`.
+/// mean of the members' states; the weight of a member is its weight in the proxy times the value of its temporal
+/// window. Frames at which all windows are 0 have no state. `recentered` holds for each member its weight, and its
+/// motion expressed around the center of the proxy. Each quaternion gets the sign that brings it nearest to the
+/// quaternion of the motion `mean`.
 fn target_states(
     members: &ClusterMembers<'_>,
     recentered: &[(f64, SpacetimeMotion)],

@@ -7,9 +7,9 @@
 use std::fs;
 use std::path::Path;
 
-use super::common::{check_kind, residence};
+use super::common::{check_kind, memory_profile};
 use super::decoder::ColorActivation;
-use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
+use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, SHARED_PARAM_COUNT, Spacetime};
 use super::proxies;
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
@@ -73,14 +73,14 @@ impl SplatvModel {
     fn open(path: &Path, options: &OpenOptions) -> Result<SplatvModel> {
         let file = Splatv::open(path)?;
         // The parameters and the row number of each Gaussian.
-        let values = (Attributes::all().width(0) + WIDTH + 1) as u64;
+        let values = (Attributes::all().width(0) + SHARED_PARAM_COUNT + 1) as u64;
         options.memory.check(path, "its texture", "the Gaussians of the file", 4 * values * file.count() as u64)?;
         let zero_rotation = options.conventions.zero_rotation.unwrap_or_default();
         let (defects, rows) = check_rows(&file, zero_rotation)?;
         let count = file.count() - defects.dropped;
         let mut raw = StoredParams {
             gaussians: Gaussians::zeros(count, 0),
-            format_specific: AttributeValues::zeros(WIDTH, count),
+            format_specific: AttributeValues::zeros(SHARED_PARAM_COUNT, count),
         };
         for i in 0..count {
             set_from_row(&mut raw, i, &SplatvGaussian::from_words(&file.words(file_row(rows.as_deref(), i))));
@@ -91,7 +91,7 @@ impl SplatvModel {
 }
 
 /// Returns the row of the file that holds Gaussian `i` of the model. `rows` lists this row for every Gaussian of the
-/// model; it is `None` if no Gaussian of the file was left out, and then the row is `i`.
+/// model. If `rows` is `None`, no Gaussian of the file was left out, and the row is `i`.
 fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
     rows.map_or(i, |rows| rows[i] as usize)
 }
@@ -184,7 +184,7 @@ impl InputModel for SplatvModel {
     }
 
     fn memory_profile(&self) -> MemoryProfile {
-        let all = residence(WIDTH);
+        let all = memory_profile(SHARED_PARAM_COUNT);
         let of_rows = if self.rows.is_some() { size_of::<u32>() as u64 } else { 0 };
         MemoryProfile { per_gaussian: all.per_gaussian + of_rows, ..all }
     }

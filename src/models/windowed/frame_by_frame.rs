@@ -1,4 +1,4 @@
-//! Motion model of files with single frames: each Gaussian is visible in one frame only.
+//! Motion model of files in which each Gaussian is visible in one frame only and does not move.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -25,8 +25,8 @@ pub(super) struct FrameByFrame {
 
 impl FrameByFrame {
     /// Creates the motion model of `frames` frames with evenly spaced times.
-    /// - If `clip` is the range from 0 to 1, frame i of n has the time i/n.
-    /// - Otherwise the first and the last frame have the first and the last time of `clip`.
+    /// - If `clip` lasts from 0 to 1, frame i of n has the time i/n.
+    /// - Otherwise the first frame has the first time of `clip`, and the last frame has its last time.
     pub(super) fn new(frames: usize, clip: ClipTimes) -> FrameByFrame {
         let is_mapped = (clip.first, clip.last) != (0.0, 1.0);
         // Frames of a converted sequence reach its last time. Without it, frame i of n begins at i/n.

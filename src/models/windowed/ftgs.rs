@@ -12,8 +12,8 @@ use crate::models::input_model::{ModelFormat, TimeOrigin};
 use crate::models::motion_model::MotionModelFrames;
 use crate::outputs::kind::OutputKind;
 
-/// Lower limit to which the standard deviation of a time window is raised, as a fraction of the length of the clip.
-/// Without it, 0/0 could arise.
+/// Minimum standard deviation of a time window, as a fraction of the length of the clip. Smaller ones are raised to it,
+/// because a standard deviation of 0 could lead to 0/0.
 pub(super) const SMALLEST_DEVIATION: f64 = 1e-9;
 
 /// Model format of `.ftgs.ply` files of ftgs-player, with linear motion in time windows: recognizes and opens a file.

@@ -1,7 +1,7 @@
 //! Files of players for Gaussians with linear motion in Gaussian windows of time, as model formats.
 //!
-//! The output has the same format with fewer Gaussians. The parameters of a Gaussian are those of
-//! [`crate::files::ftgs`], and FreeTimeGS has the same motion.
+//! The output has the same format with fewer Gaussians. The Gaussians have the parameters that [`crate::files::ftgs`]
+//! describes. FreeTimeGS models have the same motion.
 
 mod frame_by_frame;
 mod ftgs;
@@ -39,19 +39,19 @@ struct WindowedModel<L: ProxyRule> {
     name: &'static str,
     /// Kind of output that has the format of this file.
     own: OutputKind,
-    /// How the times of frames are determined: frames can be at any time, or the file fixes their number or times.
+    /// Whether frames can be at any time, the file fixes their number, or the file fixes their times.
     timing: TimeOrigin,
     /// Notes for the user: repairs and guesses made while the file was opened.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
-    /// Function and options to open the `.ftgs.ply` in an archive of this file. `None` for Gaussians without windows of
-    /// time: a `.ftgs.ply` cannot hold them, so archives of this file hold frames instead.
+    /// Function and options to open the `.ftgs.ply` that an archive of this file holds. `None` for Gaussians without
+    /// windows of time: a `.ftgs.ply` cannot hold them, so archives of this file hold frames instead.
     reopener: Option<Reopener>,
 }
 
 impl<L: ProxyRule> WindowedModel<L> {
-    /// Returns the function and options to open the `.ftgs.ply` in an archive of this file. Fails if archives of this
-    /// file hold frames instead.
+    /// Returns the function and options to open the `.ftgs.ply` that an archive of this file holds. Fails if archives
+    /// of this file hold frames instead.
     fn reopener(&self) -> Result<&Reopener> {
         self.reopener.as_ref().ok_or_else(|| Error::internal("an archive of frames was written as a model"))
     }

@@ -224,8 +224,8 @@ impl ModelFolder {
     }
 
     /// Returns the changes (deltas) that the deformation field makes at `time` to Gaussians at the canonical positions
-    /// `position` `[N, 3]`, which need not belong to this model. [`Deltas::invert`] computes stored parameters from a
-    /// desired state.
+    /// `position` `[N, 3]`. These Gaussians need not belong to this model. From the deltas, [`Deltas::invert`] computes
+    /// the stored parameters that lead to a desired state.
     ///
     /// # Errors
     /// Fails if the field cannot be evaluated.
@@ -285,8 +285,8 @@ impl Deformation for ModelFolder {
     }
 
     /// Returns the attributes that the optimizer can change. Excludes positions if the field has a mask (factor on the
-    /// stored attributes of each Gaussian): derivatives treat the mask as constant, so a moved position would be worse
-    /// than an unchanged one.
+    /// stored attributes of each Gaussian). Derivatives treat the mask as constant, so a step along them would make
+    /// positions worse.
     fn movable(&self) -> Attributes {
         if self.field.has_mask() { Attributes::all().difference(Attributes::POSITION) } else { Attributes::all() }
     }
