@@ -64,8 +64,8 @@ pub(super) struct PointCloudShape {
     pub(super) columns: Vec<ColumnShape>,
     /// Minimum of the positions of all Gaussians on each axis, in quantization steps.
     pub(super) lowest: [i64; 3],
-    /// Number of low bits of each coordinate of a position that are stored as plain bits. The Morton curve does not use
-    /// these bits.
+    /// Number of low bits of each coordinate of a position that are stored as plain bits, because the index along the
+    /// Morton curve has no room for them.
     #[serde(rename = "loose")]
     pub(super) plain_bits: u32,
     /// Mean of every plane (scalar component), in quantization steps. The three planes of the position have none.
@@ -80,8 +80,9 @@ pub(super) struct PointCloudShape {
 #[derive(Debug, Clone, Copy)]
 struct Plane {
     source: PlaneSource,
-    /// Group of planes with which this plane shares its quantization step and entropy models: an attribute (its index
-    /// in [`ATTRIBUTES`]) or a column (the number of attributes plus the index of the column).
+    /// Group of planes with which this plane shares its quantization step and entropy models. The planes of an
+    /// attribute are one group: its index in [`ATTRIBUTES`]. The planes of a column are one group: the number of
+    /// attributes plus the index of the column.
     group: usize,
 }
 
@@ -201,9 +202,12 @@ fn curve_index(place: &[u64; 3], plain_bits: u32) -> u64 {
 }
 
 /// Encodes the Gaussians `cloud` with the quantization steps `steps` of their attributes, and the further values
-/// `columns` with the steps `column_steps`. Returns the parameters for decoding, the entropy-coded symbols, and for
-/// each Gaussian in the new order its index in `cloud`. Adds the approximate number of bits of every attribute and
-/// column to `bits`.
+/// `columns` with the steps `column_steps`. Returns three results:
+/// - the parameters that a decoder needs
+/// - the entropy-coded symbols
+/// - for each Gaussian in the order of the decoder: its index in `cloud`
+///
+/// Adds the approximate number of bits of every attribute and column to `bits`.
 pub(super) fn encode(
     cloud: &Gaussians,
     columns: &[Column],
@@ -252,14 +256,14 @@ pub(super) fn encode(
         let sum: i128 = multiples.iter().map(|&multiple| i128::from(multiple)).sum();
         let mean = (sum / multiples.len().max(1) as i128) as i64;
         let mut fit = PredictorFit::new();
-        coder.clone().plane(group, grid, mean, |i, around, _, _| {
+        coder.clone().code_plane(group, grid, mean, |i, around, _, _| {
             fit.add(around, grid.value(multiples[i]) - grid.value(mean));
             (multiples[i], 0)
         });
         let weights = fit.weights();
         let factors = factors(&weights);
         let before = encoder.cost();
-        coder.plane(group, grid, mean, |i, around, size, models| {
+        coder.code_plane(group, grid, mean, |i, around, size, models| {
             let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
             (multiples[i], models.encode(multiples[i], predicted, size, &mut encoder))
         });
@@ -302,7 +306,7 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
             PlaneSource::Attribute(attribute, c) => cloud.column_mut(attribute).plane_mut(c),
             PlaneSource::Column(column, c) => columns[column].values.plane_mut(c),
         };
-        coder.plane(coded.group, grid, mean, |i, around, size, models| {
+        coder.code_plane(coded.group, grid, mean, |i, around, size, models| {
             let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
             let (multiple, residual) = models.decode(predicted, size, &mut decoder);
             plane[i] = grid.value(multiple);
@@ -347,9 +351,10 @@ impl CurveDistances {
 #[derive(Clone)]
 struct PlaneCoder {
     /// Values of the two planes (scalar components of all Gaussians) coded last, the most recent one first: one value
-    /// per Gaussian, less the mean of its plane.
+    /// per Gaussian, minus the mean of its plane.
     known: [Vec<f32>; 2],
-    /// Moving average of the absolute prediction errors of each Gaussian over the planes, in quantization steps.
+    /// For each Gaussian: moving average, over the planes coded so far, of the absolute prediction error of its values,
+    /// in quantization steps.
     sizes: Vec<f32>,
     /// Group ([`Plane::group`]) of the plane that is being coded. All planes of a group share the entropy models.
     group: usize,
@@ -370,12 +375,12 @@ impl PlaneCoder {
     /// - `grid`: quantization grid of the values.
     /// - `mean`: mean of the values, in quantization steps.
     ///
-    /// `code` encodes or decodes one value:
-    /// - Arguments: index of the Gaussian, known values to predict from, expected absolute prediction error in
-    ///   quantization steps, entropy models.
-    /// - Results: quantized value, and prediction error (quantized less predicted value), both in quantization steps.
+    /// `code` encodes or decodes one value of the plane:
+    /// - Arguments: index of the Gaussian, known values to predict from (each minus the mean of its plane), expected
+    ///   absolute prediction error in quantization steps, entropy models.
+    /// - Results: quantized value, and prediction error (quantized minus predicted value), both in quantization steps.
     #[inline(always)]
-    fn plane(
+    fn code_plane(
         &mut self,
         group: usize,
         grid: QuantizationGrid,

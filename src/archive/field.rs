@@ -18,9 +18,13 @@ use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::AttributeValues;
 
-/// Number that is subtracted from the exponent `k` of a texel's quantization step 2^(k/8) for each doubling of the
-/// texel's importance: with 4, each doubling divides the step by √2. The importance is the sum of the squared
-/// interpolation weights with which Gaussians read the texel; the squared error of the texel counts in proportion.
+/// Decrease of a texel's step exponent for each doubling of its importance w. The step of a texel is 2^(k/8), with
+///
+/// k = exponent of its channel − 4 · ⌊log2 w⌋,
+///
+/// so each doubling of w divides the step by √2. w is the sum of the squared interpolation weights with which Gaussians
+/// read the texel. The sum of the squared errors that an error of the texel causes at these Gaussians is proportional
+/// to w.
 const FINER_PER_OCTAVE: i32 = 4;
 
 /// Class of a weight whose quantization step has no offset. A class is a number that selects the quantization step of a
@@ -84,12 +88,13 @@ pub struct TensorSteps {
     pub channels: Vec<i8>,
 }
 
-/// Positions and times at which the deformation field is evaluated. They determine which texels of its feature planes
-/// are read. `position` holds the canonical positions of the Gaussians. `space` is the box that the feature planes
-/// cover.
+/// Points in space and time at which the deformation field is evaluated. They determine which texels of its feature
+/// planes are read.
 #[derive(Debug)]
 pub(super) struct Readers<'a> {
+    /// Canonical positions of the Gaussians.
     pub(super) position: &'a AttributeValues,
+    /// Box of space that the feature planes cover; `None` if the field has no feature planes.
     pub(super) space: Option<Box3>,
     /// First and last time at which the field is evaluated.
     pub(super) times: [f32; 2],
@@ -121,8 +126,8 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the number of places of the tensor (pairs of a row and a column) for which a coder keeps an error
-    /// average from channel to channel. Returns 0 for a tensor with a single channel, which needs no averages.
+    /// Returns the number of moving averages that a coder of the tensor keeps: one prediction error per place (row and
+    /// column), averaged over the channels. Returns 0 for a tensor with a single channel, which needs no averages.
     pub(super) fn places(&self) -> usize {
         let [channels, rows, columns] = self.extents();
         if channels > 1 { rows.saturating_mul(columns) } else { 0 }
@@ -171,7 +176,8 @@ impl TensorEntry {
     /// Returns the quantization grid of a value in channel `channel` whose class is `class`. A class is a number that
     /// writer and reader of an archive compute for each value:
     /// - for a weight: [`ZERO_OFFSET_CLASS`] plus the step offsets of its row and of its column
-    /// - for a texel: a number that grows with the texel's total read weight; see [`texels::octaves`]
+    /// - for a texel: a number that grows with the sum of the squared weights with which Gaussians read the texel; see
+    ///   [`texels::octaves`]
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
             TensorRole::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
@@ -329,8 +335,8 @@ pub(super) fn decode(
 /// `steps`. `position` holds the canonical positions of the Gaussians; `space` is the box of space that the feature
 /// planes cover.
 ///
-/// Planes over time differ from those of an archive: here every row keeps its own rounded values. An archive stores
-/// only the rows that frame times read, and restores the other rows as copies of these.
+/// Planes over time differ from those of an archive: this function rounds every row. An archive stores only the rows
+/// that are read at the times of the frames, and restores each other row as a copy of the nearest stored row.
 pub fn round_tensor(
     tensor: &Tensor,
     role: TensorRole,

@@ -3,7 +3,7 @@
 //!
 //! Input: a state dict (tensors by name), positions and times. Output: for every tensor the offsets added to its
 //! quantization step, one per channel of a plane, or one per row and column of a matrix. The estimate is of first order
-//! and assumes that the errors of different values are independent. An error of a plane is multiplied by the product of
+//! and assumes that the errors of different values are independent. It multiplies an error of a plane by the product of
 //! the five other planes, an error of a weight by the input of that weight, and both by the weights of all later
 //! layers. Only the writer of an archive uses these numbers, so rounding differences between machines are harmless.
 
@@ -14,9 +14,9 @@ use crate::deform::{Box3, Tensor, Tensors, TexelPair, texel_pair};
 use crate::model::AttributeValues;
 
 /// Maximum number of Gaussians at whose positions the deformation field is evaluated to estimate the effect of errors.
-const GAUSSIANS: usize = 256;
+const MAX_SAMPLED_GAUSSIANS: usize = 256;
 /// Number of points in time at which the deformation field is evaluated for each sampled Gaussian.
-const TIMES: usize = 4;
+const TIMES_PER_GAUSSIAN: usize = 4;
 /// Step between possible offsets of quantization steps, in eighths of an octave. Offsets are multiples of 4 eighths,
 /// that is, of half an octave (a factor of √2).
 const OFFSET_UNIT: f64 = 4.0;
@@ -69,16 +69,16 @@ pub fn step_offsets(
         let output_importance = vec![1.0; output.outputs()];
         let hidden_importance = output.backward(&output_importance, &active_fraction(&inside, hidden.outputs()));
         let input_importance = hidden.backward(&hidden_importance, &active);
-        // Every head has the same total importance here; how the steps of different heads relate is decided with
-        // renders.
+        // Every head gets the same total importance here. The relation between the steps of different heads is chosen
+        // elsewhere, by rendering.
         let all: f64 = input_importance.iter().sum::<f64>().max(f64::MIN_POSITIVE);
         leaving.iter_mut().zip(&input_importance).for_each(|(sum, x)| *sum += x / all);
-        add(&mut found, &hidden, &hidden_importance, &read);
-        add(&mut found, &output, &output_importance, &mean_squares(&inside, output.inputs()));
+        insert_offsets(&mut found, &hidden, &hidden_importance, &read);
+        insert_offsets(&mut found, &output, &output_importance, &mean_squares(&inside, output.inputs()));
     }
     // Backward pass through the trunk (the layers that all heads share).
     for (layer, read) in reads.iter().rev() {
-        add(&mut found, layer, &leaving, read);
+        insert_offsets(&mut found, layer, &leaving, read);
         let ones = vec![1.0; layer.inputs()];
         leaving = layer.backward(&leaving, &ones);
     }
@@ -89,10 +89,10 @@ pub fn step_offsets(
     found
 }
 
-/// Adds two entries to `found`: the offsets of quantization steps ([`importance_offsets`]) of the weights of `layer`
-/// and those of its bias, each by tensor name. `rows`: importance of each output of the layer, that is, how strongly
-/// its errors change the result of the field. `columns`: mean square of each input of the layer.
-fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
+/// Inserts two entries into `found`, by tensor name: the quantization step offsets ([`importance_offsets`]) of the
+/// weights of `layer`, and those of its bias. `rows`: importance of each output of the layer, that is, how strongly an
+/// error of the output changes the result of the field. `columns`: mean square of each input of the layer.
+fn insert_offsets(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
     found.insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
     found.insert(format!("{}.bias", layer.name), importance_offsets(rows));
 }
@@ -179,7 +179,7 @@ impl WeightLayer<'_> {
 
     /// Returns the importance of each input of the layer, given the importance of each output, `outputs`. Importance
     /// says how strongly an error of a value changes the result of the field. `active`: for each input, the fraction of
-    /// samples in which it is above zero, that is, passes the ReLU before this layer.
+    /// samples in which the input is above zero, that is, passes the ReLU before this layer.
     fn backward(&self, outputs: &[f64], active: &[f64]) -> Vec<f64> {
         let mut inputs = vec![0.0; self.inputs()];
         for (row, output_importance) in self.weight.data.chunks_exact(self.inputs()).zip(outputs) {
@@ -227,9 +227,10 @@ struct Samples {
 const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
-    /// Evaluates the feature planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each, from `first` to
-    /// `last`. Returns the resulting inputs of the trunk (the layers that all heads share); `None` if the planes are
-    /// missing or malformed. `position` holds the canonical positions; `space` is the box that the planes cover.
+    /// Evaluates the feature planes for at most [`MAX_SAMPLED_GAUSSIANS`] Gaussians at [`TIMES_PER_GAUSSIAN`] times
+    /// each, between the times `first` and `last`. Returns the resulting inputs of the trunk (the layers that all heads
+    /// share); `None` if the planes are missing or malformed. `position` holds the canonical positions; `space` is the
+    /// box that the planes cover.
     fn new(tensors: &Tensors, position: &AttributeValues, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();
@@ -244,14 +245,14 @@ impl Samples {
             levels.push(planes);
         }
         let width = levels.iter().map(|planes| planes[0].shape[1]).sum();
-        let count = GAUSSIANS.min(position.len());
-        let mut features = Vec::with_capacity(count * TIMES * width);
+        let count = MAX_SAMPLED_GAUSSIANS.min(position.len());
+        let mut features = Vec::with_capacity(count * TIMES_PER_GAUSSIAN * width);
         let mut squares = vec![vec![0.0f64; width]; 6];
-        for sample in 0..count * TIMES {
-            let (i, k) = (sample / TIMES, sample % TIMES);
+        for sample in 0..count * TIMES_PER_GAUSSIAN {
+            let (i, k) = (sample / TIMES_PER_GAUSSIAN, sample % TIMES_PER_GAUSSIAN);
             let [x, y, z] = space.normalized(position.row(i * position.len() / count));
-            // Each Gaussian is sampled at other times.
-            let part = (k as f32 + (i as f32 * 0.618).fract()) / TIMES as f32;
+            // Different Gaussians are sampled at different times.
+            let part = (k as f32 + (i as f32 * 0.618).fract()) / TIMES_PER_GAUSSIAN as f32;
             let at = [x, y, z, first + part * (last - first)];
             for planes in &levels {
                 let channels = planes[0].shape[1];

@@ -161,8 +161,8 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
     let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.in_file(path))?;
     let table = table(&sections, bytes.len()).map_err(|damage| damage.in_file(path))?;
     let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
-    // While decoding, two values and one mean error size (12 bytes) are kept for each Gaussian.
-    // While decoding a tensor, one mean error size is kept for each of its places.
+    // While decoding, a coder keeps two values and one mean error size (12 bytes) for each Gaussian. While decoding a
+    // tensor, a coder keeps one mean error size (4 bytes) for each place of the tensor.
     let places = table.tensors.iter().map(TensorEntry::places).max().unwrap_or(0) as u64;
     let needed = head.bytes() + 4 * values + 4 * places + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
@@ -199,9 +199,9 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
     Ok(table)
 }
 
-/// Decodes the contents of the archive sections `sections`, whose table of contents `table` has been checked. Returns
-/// the content, together with the argument `parts`, the size of the archive by purpose. Fails if the sections do not
-/// match the table.
+/// Decodes the archive sections `sections`, whose table of contents `table` has been checked. Returns the content of
+/// the archive, and `parts` (the size of the archive by purpose) unchanged. Fails if the sections do not match the
+/// table.
 fn decoded(
     sections: Sections,
     table: Table,

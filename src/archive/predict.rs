@@ -1,5 +1,6 @@
-//! Prediction of a value: a mean plus a weighted sum of differences. Each difference is a known neighboring value less
-//! its own mean.
+//! Linear prediction of a value from `N` known neighboring values:
+//!
+//! predicted = mean + Σₖ weightₖ · differenceₖ, where differenceₖ is a neighboring value minus its own mean.
 
 /// Denominator of the predictor weights, which are multiples of 1/64.
 const WEIGHT_DENOMINATOR: f32 = 64.0;
@@ -41,7 +42,7 @@ impl<const N: usize> PredictorFit<N> {
         PredictorFit { products: [[0.0; N]; N], with_value: [0.0; N] }
     }
 
-    /// Adds a sample to the least-squares fit: `value`, the value to predict less the mean of all such values, and the
+    /// Adds a sample to the least-squares fit: `value`, the value to predict minus the mean of all such values, and the
     /// `differences` from which it is predicted.
     #[inline(always)]
     pub(super) fn add(&mut self, differences: &[f32; N], value: f32) {
@@ -53,9 +54,9 @@ impl<const N: usize> PredictorFit<N> {
         }
     }
 
-    /// Returns the fitted predictor weights in 64ths. Solves the normal equations by Cholesky factorization, with a
-    /// ridge of 1e-4 times the mean diagonal so that they are solvable. Returns zeros if the differences of all samples
-    /// are 0, or if a difference is not finite.
+    /// Returns the fitted predictor weights in 64ths. Solves the normal equations by Cholesky factorization. To keep
+    /// them solvable, first adds 1e-4 times the mean of the diagonal to every diagonal element. Returns zeros if the
+    /// differences of all samples are 0, or if a difference is not finite.
     pub(super) fn weights(mut self) -> PredictorWeights<N> {
         let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
         if !(trace.is_finite() && trace > 0.0) {

@@ -1,8 +1,9 @@
 //! Codes a tensor as channels of rows of values. Each value is predicted from its neighbors to the left and above.
 //!
-//! Input: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the
-//! quantization step of the place or marks it as never read. Output: symbols, and the values that a decoder restores.
-//! Memory: three rows, and one value per place (row and column) if there are several channels.
+//! Input: values `[channels, rows, columns]`, and a class for every place (row and column). The class selects the
+//! quantization step of the place, or marks the place as never read by the deformation field. Output: symbols, and the
+//! values that a decoder restores. Memory: three rows, and one value per place (row and column) if there are several
+//! channels.
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
@@ -37,10 +38,11 @@ pub(super) struct QuantizedTensor<'a> {
 
 /// Known values from which the value at a place (row and column) is predicted.
 struct Context {
-    /// Values of the neighbors of the place, less the mean of the tensor.
+    /// Values of the neighbors of the place, minus the mean of the tensor.
     values: [f32; NEIGHBORS],
-    /// Expected absolute prediction error at the place, in quantization steps. It is a weighted mean of two values: the
-    /// errors at neighboring places, and the moving average of the errors at this place in earlier channels.
+    /// Expected absolute prediction error at the place, in quantization steps. If the tensor has several channels, it
+    /// is a weighted mean of the errors at neighboring places and the moving average of the errors at this place in
+    /// earlier channels. Otherwise it is the mean of the errors at neighboring places.
     size: f32,
 }
 
@@ -69,11 +71,11 @@ impl QuantizedTensor<'_> {
         }
     }
 
-    /// Returns predictor weights (with which a value is predicted from its neighbors) that give the least squared
-    /// prediction error for the values `data`. Also rounds `data` in place to the quantization grids.
+    /// Rounds the values `data` in place to the quantization grids. Returns the predictor weights (with which a value
+    /// is predicted from its neighbors) that give the least squared prediction error for the rounded values.
     pub(super) fn fit(&self, data: &mut [f32]) -> PredictorWeights<NEIGHBORS> {
         let mut fit = PredictorFit::new();
-        self.visit(data, |_, value, context, grid| {
+        self.code_data(data, |_, value, context, grid| {
             let value = grid.round(value);
             fit.add(&context.values, value - self.mean);
             (value, 0.0)
@@ -91,7 +93,7 @@ impl QuantizedTensor<'_> {
         to: &mut SymbolEncoder,
     ) {
         let factors = factors(weights);
-        self.visit(data, |_, value, context, grid| {
+        self.code_data(data, |_, value, context, grid| {
             let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
             let multiple = grid.multiple(value);
             let residual = models.encode(multiple, predicted, context.size, to);
@@ -109,26 +111,27 @@ impl QuantizedTensor<'_> {
         from: &mut SymbolDecoder<'_>,
     ) {
         let factors = factors(weights);
-        self.visit(data, |_, _, context, grid| {
+        self.code_data(data, |_, _, context, grid| {
             let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
             let (multiple, residual) = models.decode(predicted, context.size, from);
             (grid.value(multiple), residual.unsigned_abs() as f32)
         });
     }
 
-    /// Replaces every value of `data` by the value that a decoder restores. Goes through the channels in order, and
-    /// through the places (row and column) of a channel row by row. There are three kinds of places:
-    /// - Places that the deformation field reads: the new value is the one that `code` returns.
-    /// - Places in a stored row that the field never reads: the new value is the mean of the new values at four
-    ///   neighbors (left, above, above left and above right).
-    /// - Places in a row that is not stored: the new value is that of the same column in the nearest stored row.
+    /// Codes the tensor and replaces each value of `data` by its decoded value. Visits the channels in order, and the
+    /// places (row and column) of a channel row by row. The rows in [`QuantizedTensor::stored`] are the stored rows.
+    /// The decoded value depends on the place:
+    /// - place in a stored row that the deformation field reads: the value that `code` returns
+    /// - place in a stored row that the field never reads ([`UNREAD`]): the mean of the decoded values at four
+    ///   neighbors (left, above, above left and above right)
+    /// - place in a row that is not stored: the decoded value in the same column of the nearest stored row
     ///
     /// `code` encodes or decodes one value:
     /// - Arguments: index of the place in its channel, old value in `data`, known neighbors, quantization grid.
     /// - Results: restored value, and absolute prediction error in quantization steps. Later places are predicted from
-    ///   the restored value. The error serves to estimate the errors of these predictions.
+    ///   the restored value. The error is used to estimate the errors of these predictions.
     #[inline(always)]
-    fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
+    fn code_data(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;
         // Each line has two extra places at the left and one at the right.
         let line = || vec![0.0f32; columns + 3];

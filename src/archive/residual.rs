@@ -34,9 +34,9 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
 /// a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Number of entropy models for the sign of a prediction error, for each distance of the predicted value from the
-/// quantization grid ([`PredictedMultiple::offset`]). Errors of magnitude 1, 2 and 3 have one model each, all larger
-/// errors share one.
+/// Number of entropy models for the sign of a prediction error, for each offset of the predicted value from the nearest
+/// grid value ([`PredictedMultiple::offset`]). Errors of magnitude 1, 2 and 3 have one model each, all larger errors
+/// share one.
 const SIGN_CONTEXTS: usize = 4;
 
 /// Entropy models of prediction errors. Similar planes or tensors share them.
@@ -45,8 +45,8 @@ pub(super) struct Residuals {
     /// Entropy models of the magnitude class of a prediction error (index in [`CLASSES`]), one for each range of the
     /// expected error size.
     classes: [SymbolModel; CONTEXTS],
-    /// Entropy models of the sign of a prediction error. First index: distance of the predicted value from the
-    /// quantization grid ([`PredictedMultiple::offset`]). Second index: magnitude class of the error less 1, at most 3.
+    /// Entropy models of the sign of a prediction error. First index: offset of the predicted value from the nearest
+    /// grid value ([`PredictedMultiple::offset`]). Second index: magnitude class of the error minus 1, at most 3.
     signs: [[BitModel; SIGN_CONTEXTS]; OFFSETS],
 }
 
@@ -64,8 +64,8 @@ impl Residuals {
         &mut self.classes[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    /// Returns the entropy model of the sign of a prediction error that is not 0. `offset`: distance of the predicted
-    /// value from the quantization grid ([`PredictedMultiple::offset`]). `class`: class of the magnitude of the error
+    /// Returns the entropy model of the sign of a prediction error that is not 0. `offset`: offset of the predicted
+    /// value from the nearest grid value ([`PredictedMultiple::offset`]). `class`: class of the magnitude of the error
     /// (index in [`CLASSES`]), at least 1.
     fn sign_model(&mut self, offset: usize, class: usize) -> &mut BitModel {
         &mut self.signs[offset][(class - 1).min(SIGN_CONTEXTS - 1)]

@@ -52,8 +52,9 @@ pub(super) const OFFSETS: usize = 8;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PredictedMultiple {
     pub(super) multiple: i64,
-    /// Position of the predicted value relative to `multiple`, in eighths of a step: the step from half a step below
-    /// the multiple to half a step above it is divided into intervals 0 to 7, and this is the index of the interval.
+    /// Offset of the predicted value from `multiple`, as the index (0 to 7) of the interval in which the value lies.
+    /// The intervals divide the step around the multiple into eighths: interval 0 begins half a step below the
+    /// multiple, and interval 7 ends half a step above it.
     pub(super) offset: usize,
 }
 

@@ -9,21 +9,22 @@ use crate::deform::{Box3, texel_pair};
 use crate::model::AttributeValues;
 
 /// Octave of class 0, the lowest class of texels (grid elements of a feature plane). Texels of lower octaves belong to
-/// class 0 too. The octave of a texel is log2, rounded down, of the sum of its squared interpolation weights over the
-/// Gaussians that read it.
+/// class 0 too. The octave of a texel is ⌊log2 w⌋, where w is the sum of the squared interpolation weights with which
+/// Gaussians read the texel.
 const MIN_EXPONENT: i32 = -8;
 /// Number of classes of texels. A class is a number that selects a texel's quantization grid. Texels belong to the same
 /// class if their squared interpolation weights, summed over the Gaussians that read them, lie in the same octave.
 pub(super) const CLASSES: usize = 16;
 
-/// Returns the octave of the texels in the class `class`: log2, rounded down, of the sum of a texel's squared
-/// interpolation weights over the Gaussians that read it. A texel that one Gaussian reads with weight 1 has octave 0.
+/// Returns the octave of the texels in the class `class`. The octave is ⌊log2 w⌋, where w is the sum of the squared
+/// interpolation weights with which Gaussians read the texel. A texel that one Gaussian reads with weight 1 has octave
+/// 0.
 pub(super) fn octaves(class: u8) -> i32 {
     i32::from(class) + MIN_EXPONENT
 }
 
-/// Returns the class of a texel, which selects its quantization grid. `squared_weight` is the sum, over the Gaussians
-/// that read the texel, of the squared interpolation weight.
+/// Returns the class of a texel, which selects its quantization grid. `squared_weight` is the sum of the squared
+/// interpolation weights with which Gaussians read the texel; if it is 0, the class is [`UNREAD`].
 fn class(squared_weight: f32) -> u8 {
     if squared_weight <= 0.0 {
         return UNREAD;
