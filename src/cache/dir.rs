@@ -20,9 +20,10 @@ use crate::files::atomic::remove_leftovers;
 #[derive(Debug)]
 pub(super) struct CacheDir {
     folder: PathBuf,
-    /// Cache key of what all results of this run depend on, such as the input. The key of every cache entry includes
-    /// it.
+    /// Digest of everything that all results of this run depend on, such as the input. The key of every cache entry
+    /// includes this digest.
     context: CacheKey,
+    /// Description of the input for people, stored in every new entry.
     about: String,
 }
 
@@ -48,7 +49,7 @@ impl CacheDir {
         self.context = self.context.extended_by(&context);
     }
 
-    /// Returns `key` combined with the context, the key on which all keys of this run depend.
+    /// Returns the key of a cache entry: `key` combined with the context ([`CacheDir::depend_on`]).
     pub(super) fn key(&self, key: CacheKey) -> CacheKey {
         self.context.extended_by(&key)
     }

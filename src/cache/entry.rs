@@ -36,7 +36,7 @@ pub(super) const EXTENSION: &str = ".piece";
 /// Maximum size, in bytes, of the buffer that holds the strings of a cache entry while its value is deserialized.
 const MAX_STRING_BYTES: u64 = 8 << 20;
 
-/// File name of a cache entry.
+/// Parts of the file name of a cache entry.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct EntryName {
     pub(super) stage: String,
@@ -94,7 +94,8 @@ pub(super) struct EntryWriter {
     text: u32,
     length: u64,
     hash: Box<Xxh3>,
-    /// Error of the last failed write. The serializer does not return it, so the writer stores it here.
+    /// Error of the last failed write. The serializer returns another error instead, which does not name the cause, so
+    /// the writer keeps the error here.
     pub(super) failed: Option<io::Error>,
 }
 

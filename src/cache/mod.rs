@@ -130,8 +130,8 @@ impl Cache {
 
     /// Returns the result of `stage` for `key` if it is stored. If it is not, computes it with `compute` and stores it.
     ///
-    /// For a stage that is not divided into shards (parts). A run that is limited to one shard also computes the whole
-    /// stage. If such a run must end before this stage, let `compute` begin with a call of
+    /// Use this method for stages that are not divided into shards (parts). A run that is limited to one shard computes
+    /// the whole stage, too. If such a run must end before this stage, let `compute` begin with a call of
     /// [`Cache::end_shard_run_before`].
     ///
     /// # Errors
@@ -151,8 +151,8 @@ impl Cache {
     }
 
     /// Ends a run that is limited to one shard (part of a divided stage), by returning an error; does nothing in any
-    /// other run. To be called before `stage`, a stage that cannot be divided: it has no shard that such a run could
-    /// compute.
+    /// other run. Call this method before `stage`, a stage that cannot be divided and so has no shard that such a run
+    /// could compute.
     ///
     /// # Errors
     /// Fails with [`Error::ShardDone`] if the run is limited to one shard.
@@ -247,7 +247,7 @@ impl Cache {
     }
 
     /// Returns the number of shards (parts) into which `stage` is divided; 1 means that it is not divided. The caller
-    /// then computes the shards that are not stored, and joins all of them. To be called only if the full result of
+    /// then computes the shards that are not stored, and joins all of them. Call this method only if the full result of
     /// `stage` is not stored.
     ///
     /// The work folder may hold shards from several runs that divided the stage into different numbers of shards. The

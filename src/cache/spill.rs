@@ -73,7 +73,7 @@ impl SpillWriter {
     /// Creates the writer of an unnamed file in `folder`. The system removes the file when the process ends.
     ///
     /// # Errors
-    /// Fails if the folder does not exist or the system refuses.
+    /// Fails if the folder does not exist or the file cannot be created in it.
     pub fn new(folder: &Path) -> Result<SpillWriter> {
         let file = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
         let writer = EntryWriter::new(file, 0, "").map_err(Error::io("write a scratch file in", folder))?;
@@ -90,8 +90,8 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: target.to_owned(), staged: Some(staged) })
     }
 
-    /// Returns the words that precede the path in error messages. For a cache entry, this path is the path of the
-    /// entry; for a scratch file, which has no name, it is the path of its folder.
+    /// Returns the words before the path in error messages about failed writes. For a cache entry, this path is the
+    /// path of the entry; for a scratch file, which has no name, it is the path of its folder.
     fn write_action(&self) -> &'static str {
         if self.staged.is_some() { "write values to" } else { "write a scratch file in" }
     }
