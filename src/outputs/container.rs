@@ -104,10 +104,10 @@ pub fn write_container(
     writer.finish()
 }
 
-/// Encodes the frame blocks with the numbers `blocks` of `source` in the encoding `packing`, and writes them to the
-/// scratch file `to`, from which [`join_container`] reads them. The file gets one record (byte string with its length)
-/// per tile, in order. An empty record means that the tile equals that of the frame block before. Calls `advance` with
-/// the number of Gaussian states (Gaussians × frames) encoded since the last call.
+/// Encodes frame blocks of `source` in the encoding `packing`, and writes them to the scratch file `to`, from which
+/// [`join_container`] reads them. `blocks`: range of the numbers of these frame blocks. The file gets one record (byte
+/// string with its length) per tile, in order. An empty record means that the tile equals that of the frame block
+/// before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last call.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or written.
@@ -324,7 +324,7 @@ pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
 }
 
 /// Encodes the frames `frames` of `source` as one frame block (consecutive frames that are stored together). `presence`
-/// tells for each block of Gaussians which of its values have to be encoded.
+/// states for each block of Gaussians how it changes, and so which of its values are encoded.
 /// - Calls `each` for every tile in the order of the container, with the index of its block of Gaussians, the index of
 ///   its column, and the tile. `None` in place of the tile means that the tile equals that of the frame block before.
 /// - Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last call.
@@ -365,8 +365,9 @@ fn encode_frames(
     Ok(())
 }
 
-/// Encodes the blocks of Gaussians with the numbers `blocks` of `source`, with the frames `frames` as one frame block.
-/// Returns the number of encoded bytes of each column (attribute), summed over these blocks. Writes no file.
+/// Returns the number of bytes that each column (attribute) would take in a container, summed over some blocks of
+/// Gaussians of `source`. `blocks`: numbers of these blocks. `frames`: frames that are encoded as one frame block.
+/// Encodes the values, but writes no file.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.

@@ -19,7 +19,7 @@ const ENCODER: &str = "ffmpeg";
 /// Speed of the color selection of a GIF, from 1 (best colors) to 30 (fastest). The library recommends 10 as a
 /// compromise.
 const GIF_SPEED: i32 = 10;
-/// Maximum number of bytes of the encoder's messages that are kept to be shown in an error.
+/// Maximum number of bytes of the encoder's messages that are kept and shown if the encoder fails.
 const MAX_MESSAGE_BYTES: u64 = 1 << 16;
 
 /// File format of a film.
@@ -223,7 +223,7 @@ impl FrameEncoder {
         let mut command = Command::new(program);
         command.args(["-hide_banner", "-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
         command.args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "pipe:0", "-an"]);
-        // Players need color at half the resolution, which requires even sizes.
+        // Players need color at half the resolution, so width and height must be even.
         command.args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]);
         command.args(match codec {
             Codec::Mp4 => &["-c:v", "libx264", "-crf", "18", "-movflags", "+faststart", "-f", "mp4"][..],

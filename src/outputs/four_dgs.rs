@@ -66,11 +66,11 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     ))
 }
 
-/// Rounds positions, scales, velocities, colors and opacities in `set` to the quantization grid of the file, so that the
-/// encoder accepts them. The encoder checks that each decoded value differs from the given one by at most half a
+/// Rounds positions, scales, velocities, colors and opacities in `set` to the quantization grid of the file, so that
+/// the encoder accepts them. The encoder checks that each decoded value differs from the given one by at most half a
 /// quantization step. This check fails for some values midway between two grid points, because decoded values are
 /// rounded to f32. Coordinates of a few scene units may lie midway between two grid points, odd 8-bit colors always do,
-/// and of 100,000 scales one or so does.
+/// and about one of 100,000 scales does.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     // The grid of logarithms of scales does not depend on the scene. That of positions follows from the median scale.
     let log_step = Steps::of(&Bounds::for_profile(options.profile, 1.0)).scale_log;

@@ -123,7 +123,7 @@ impl PackedFrame {
         let visible = |&row: &usize| opacity(state.opacity_logit.row::<1>(row)[0]) >= MIN_VISIBLE_OPACITY;
         let seen: Vec<usize> = (0..state.len()).filter(visible).collect();
         let rows: Vec<usize> = seen.iter().copied().filter(|&row| is_finite(state, row)).collect();
-        let places: Vec<[f64; 3]> = rows.iter().map(|&row| turned(state.position.row(row)).map(f64::from)).collect();
+        let places: Vec<[f64; 3]> = rows.iter().map(|&row| to_unreal(state.position.row(row)).map(f64::from)).collect();
         let bounds = [f64::min, f64::max].map(|extreme| {
             let of_axis = |axis: usize| places.iter().map(|place| CENTIMETERS * place[axis]).reduce(extreme);
             [0, 1, 2].map(|axis| of_axis(axis).unwrap_or(0.0))
@@ -135,7 +135,7 @@ impl PackedFrame {
         let pixels = side(rows.len()).pow(2);
         let mut textures = Vec::with_capacity(pixels * (16 + 3 * 8));
         let position = |row: usize| {
-            let [x, y, z] = turned(state.position.row(row));
+            let [x, y, z] = to_unreal(state.position.row(row));
             [x, y, z, 0.0].map(f32::to_le_bytes)
         };
         add_texture(&mut textures, pixels, &rows, [0.0, 0.0, 0.0, 1.0].map(f32::to_le_bytes), position);
@@ -179,7 +179,7 @@ fn is_finite(state: &Gaussians, row: usize) -> bool {
 }
 
 /// Converts a position from the scene's axes to Unreal's axes.
-fn turned([x, y, z]: [f32; 3]) -> [f32; 3] {
+fn to_unreal([x, y, z]: [f32; 3]) -> [f32; 3] {
     [z, x, -y]
 }
 

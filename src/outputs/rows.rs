@@ -121,9 +121,9 @@ impl RowTable<'_> {
             .large_file(large);
         for (name, values) in self.columns() {
             match values {
-                TableColumn::F64(values) => add(&mut archive, name, options, values)?,
-                TableColumn::U32(values) => add(&mut archive, name, options, values)?,
-                TableColumn::Bool(values) => add(&mut archive, name, options, values)?,
+                TableColumn::F64(values) => add_array(&mut archive, name, options, values)?,
+                TableColumn::U32(values) => add_array(&mut archive, name, options, values)?,
+                TableColumn::Bool(values) => add_array(&mut archive, name, options, values)?,
             }
         }
         archive.zip_writer().finish()?.close()
@@ -144,7 +144,7 @@ impl RowTable<'_> {
     }
 }
 
-fn add<T, W>(archive: &mut NpzWriter<W>, name: &str, options: FileOptions, values: &[T]) -> io::Result<()>
+fn add_array<T, W>(archive: &mut NpzWriter<W>, name: &str, options: FileOptions, values: &[T]) -> io::Result<()>
 where
     T: npyz::AutoSerialize + Copy,
     W: Write + io::Seek,

@@ -32,7 +32,7 @@ const OPACITY_MARGIN: f64 = 1e-6;
 pub const MAX_SINGLE_FRAME_GAUSSIANS: usize = 1_000_000;
 /// Maximum fraction of the visible states (Gaussians × frames, weighted by opacity) in which fitted linear motions may
 /// be far off ([`FitError::far_off_fraction`]). If the fraction is larger, single frames are written.
-const MAX_FAR_SHARE: f64 = 0.1;
+const MAX_FAR_OFF_FRACTION: f64 = 0.1;
 /// Maximum number of intervals into which the trajectory of a Gaussian is divided to fit linear motions for a `.tsog`.
 /// More intervals would cost many bytes, and only few Gaussians need them.
 const COMPACT_INTERVALS: usize = 8;
@@ -76,7 +76,8 @@ pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Res
 
 /// Writes all frames of `source` to the file `path` in the format `kind`, as fitted Gaussians with linear motion and an
 /// opacity that is a Gaussian function of time. Writes a `.tsog` as single frames instead if the fit is too inaccurate
-/// or takes more bytes. Returns notes for the user: the errors of the fit, and what was written instead.
+/// or would take more bytes than the frames. Returns notes for the user: the errors of the fit, and what was written
+/// instead.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -124,13 +125,14 @@ pub fn write_fitted_windows(
 
 /// Returns whether single frames are written instead of `lines`, which are fitted Gaussians with linear motion.
 /// `misfit` is the error of the fit. One of two reasons must hold:
-/// - `lines` are far off in more than the fraction [`MAX_FAR_SHARE`] of the visible states (one Gaussian at one frame).
+/// - `lines` are far off in more than the fraction [`MAX_FAR_OFF_FRACTION`] of the visible states. (A state is one
+///   Gaussian at one frame.)
 /// - Single frames, which have no fit error, take no more bytes by an estimate.
 ///
 /// Single frames are never written if they have more than [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians or [`MAX_FRAMES`]
 /// frames.
 fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
-    let is_far_off = misfit.far_off_fraction() > MAX_FAR_SHARE;
+    let is_far_off = misfit.far_off_fraction() > MAX_FAR_OFF_FRACTION;
     let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
     let frames = lines.clip.frames.unwrap_or(1);
     (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAME_GAUSSIANS as u64 && frames <= MAX_FRAMES
