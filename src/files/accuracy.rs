@@ -89,8 +89,8 @@ pub fn check_positions(state: &Gaussians, path: &Path, kind: &str) -> Result<()>
     )))
 }
 
-/// Coding error (original minus stored value) of one attribute of Gaussian `id` that exceeds its allowed maximum
-/// `bound`. `quantity` is the name of the attribute for messages.
+/// Coding error of one attribute of Gaussian `id` that exceeds its allowed maximum `bound`. `error` is the magnitude of
+/// the difference between the original and the stored value. `quantity` is the name of the attribute for messages.
 #[derive(Debug, Clone, Copy)]
 struct Excess {
     id: usize,
@@ -111,8 +111,8 @@ pub struct CodingErrors {
     furthest: usize,
     /// Largest error of a position so far, in scene units.
     position: f64,
-    /// Number of Gaussians with a scale that is stored more than 1/10 too small. This is allowed, because the stored
-    /// scale is still at least ten times as large as the scene.
+    /// Number of Gaussians with a scale that is stored too small by more than its bound. This is allowed, because the
+    /// stored scale is still at least ten times the distance from the Gaussian to the far side of the scene.
     reduced_scales: usize,
     /// Error that exceeds its allowed maximum by the largest factor; `None` if no error exceeds its maximum.
     worst: Option<Excess>,
@@ -135,8 +135,9 @@ impl CodingErrors {
         self.position
     }
 
-    /// Returns the number of Gaussians added so far with a scale that is stored more than 1/10 too small. This is
-    /// allowed, because the stored scale is still at least ten times as large as the scene.
+    /// Returns the number of Gaussians added so far with a scale that is stored too small by more than its bound. This
+    /// is allowed, because the stored scale is still at least ten times the distance from the Gaussian to the far side
+    /// of the scene.
     pub fn reduced_scales(&self) -> usize {
         self.reduced_scales
     }

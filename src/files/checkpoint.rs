@@ -32,8 +32,8 @@ use crate::limits::ReadLimit;
 const MAX_PICKLE: u64 = 1 << 23;
 /// Maximum number of files in the zip archive of a checkpoint.
 const MAX_ENTRIES: u64 = 1 << 16;
-/// Bytes of memory to count per file of the zip archive, for the list of files in memory. Three times the length of the
-/// list in the archive is counted in addition.
+/// Estimated memory, in bytes, that the list of files of the zip archive takes per file. The whole list takes
+/// `ENTRY_BYTES` × files + 3 × (length in bytes of the list in the archive).
 const ENTRY_BYTES: u64 = 640;
 /// Maximum ratio of the number of elements of a tensor to the number of values in its storage (block of tensor values).
 /// Trained models do not exceed it. The limit is needed because a tensor may repeat stored values (stride 0), so a
@@ -149,11 +149,12 @@ pub(crate) struct TensorView {
     pub(crate) shape: Vec<usize>,
     pub(crate) stride: Vec<usize>,
     pub(crate) offset: usize,
+    /// Byte ranges, in the pickle, of the numbers that describe this tensor.
     pub(crate) places: NumberRanges,
 }
 
-/// Byte ranges of some numbers in a pickle: those that describe one tensor. A writer replaces these numbers to change
-/// the shape of the tensor.
+/// Byte ranges, in the pickle, of the numbers that describe one tensor. A writer replaces these numbers to change the
+/// shape of the tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct NumberRanges {
     /// Byte range of the number that states how many values the storage holds.

@@ -21,8 +21,8 @@
 //! A file that is in the page cache is read one frame block after another. When a reader that decodes whole frame
 //! blocks enters a block, it tells the system which block comes next, so that the system reads it ahead. A file that is
 //! not in the page cache is read in stages by a scan (pass over all frames): one thread fetches bytes from the disk
-//! before others need them ([`FrameSource::ahead`]). Times of a scan on the same machine, by frame blocks and in
-//! stages:
+//! before others need them ([`FrameSource::ahead`]). Times of a scan on the same machine, the first by frame blocks,
+//! the second in stages:
 //!
 //! | file | raw tiles, ms | compressed tiles, ms |
 //! |---|---|---|

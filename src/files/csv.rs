@@ -1,7 +1,7 @@
 //! Formats CSV tables: a header line of names, then one line per row. A missing value is an empty field.
 //!
-//! Spreadsheets execute a field that begins with one of `= + - @`, a tab or a carriage return as a formula. An
-//! apostrophe is put before such a field, which marks it as text. Numbers are unchanged.
+//! Spreadsheets execute a field that begins with one of `= + - @`, a tab or a carriage return as a formula. This module
+//! puts an apostrophe before such a field, which marks it as text. Numbers stay unchanged.
 
 use std::fmt::Display;
 

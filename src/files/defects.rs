@@ -101,7 +101,7 @@ impl Defects {
     }
 }
 
-/// Returns a list for messages of the first five row indices or ids, such as `3, 7, 9`, followed by dots if there are
+/// Returns the first five row indices or ids as a list for messages, such as `3, 7, 9`, followed by dots if there are
 /// more. `count` is the number of all indices; `first` holds at least the first five of them, or all if there are
 /// fewer.
 pub fn first_of(first: &[u32], count: usize) -> String {

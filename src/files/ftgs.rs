@@ -31,8 +31,8 @@ pub const PARAMS_PER_GAUSSIAN: usize = 5;
 /// Smallest standard deviation with which the player shows a time window, as a fraction of the length of the sequence.
 /// The player raises smaller standard deviations to this value.
 pub const MIN_TIME_DEVIATION: f64 = 0.02;
-/// Opacity to which the player raises the opacity of every Gaussian at every time, if it is lower. Written to the
-/// header, and assumed if a header does not state it.
+/// Minimum opacity of every Gaussian at every time: the player raises lower opacities to it. This value is written to
+/// the header, and assumed if a header does not state one.
 const OPACITY_FLOOR: f64 = 1e-4;
 /// Names of the properties that a `.ftgs.ply` file has in addition to those of an INRIA PLY, in the order of
 /// [`StoredParams::format_specific`].
@@ -92,7 +92,7 @@ pub struct FtgsHeader {
     /// Smallest standard deviation with which the player shows a time window, as a fraction of the length of the
     /// sequence.
     pub min_deviation: f64,
-    /// Opacity to which the player raises the opacity of every Gaussian at every time, if it is lower.
+    /// Minimum opacity of every Gaussian at every time: the player raises lower opacities to it.
     pub opacity_floor: f64,
     /// Whether the velocities are used; if not, the Gaussians do not move.
     uses_velocity: bool,

@@ -21,8 +21,9 @@ pub mod write;
 pub const MAGIC: u32 = 0x4654_6c67;
 /// Version of glTF that is read and written.
 const VERSION: u32 = 2;
-/// Chunk type of the JSON text in a `.glb` file. `BINARY` is the chunk type of the values.
+/// Chunk type of the JSON text in a `.glb` file.
 const JSON: u32 = 0x4e4f_534a;
+/// Chunk type of the values of the attributes in a `.glb` file.
 const BINARY: u32 = 0x004e_4942;
 /// Name of the glTF extension for Gaussians, and prefix of the names of its attributes.
 const EXTENSION: &str = "KHR_gaussian_splatting";

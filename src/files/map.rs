@@ -15,8 +15,8 @@ use splat_platform::{FileIdentity, FileStatus, release_pages};
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Number of bytes of a mapped file that may be resident (in memory). When it is exceeded, the pages of the map are
-/// released, which takes about 2 µs.
+/// Maximum number of bytes of a mapped file that are resident (in memory). When it is exceeded, the map releases all
+/// its pages, which takes about 2 µs.
 const MAX_RESIDENT_BYTES: usize = 2 << 20;
 /// Bytes around a page read by this process that the system may map together with it (Linux: fault-around of 64 KiB).
 const FAULT_AROUND_BYTES: usize = 1 << 16;
@@ -30,9 +30,10 @@ pub(crate) struct FileMap {
     identity: Option<FileIdentity>,
     map: Mmap,
     /// Estimated number of bytes of the map that are in memory: the bytes reported as read since pages were last
-    /// released, and up to 64 KiB around each reported range. `last_end` is the end of the last range that was
-    /// reported.
+    /// released, and for each reported range up to 64 KiB of the gap to the range before it, which the system may have
+    /// mapped too.
     resident: AtomicUsize,
+    /// End of the range of the map that was reported last.
     last_end: AtomicUsize,
 }
 

@@ -27,11 +27,11 @@ use crate::error::{Error, Result};
 const MAX_ARRAYS: usize = 4096;
 /// Maximum size in bytes of the list of files that an archive has at its end.
 const MAX_LIST: u64 = 4 << 20;
-/// Maximum size of all decoded arrays, which are written to a scratch file, in bytes per byte of the archive.
-/// [`BASE_SCRATCH_BYTES`] are allowed in addition. Trained models need 1 to 2 bytes per byte.
+/// Number of bytes of decoded arrays, which are written to scratch files, that are allowed per byte of the archive. The
+/// limit for an archive of n bytes is [`BASE_SCRATCH_BYTES`] + `SCRATCH_PER_BYTE` · n. Trained models need n to 2n
+/// bytes.
 const SCRATCH_PER_BYTE: u64 = 64;
-/// Size in bytes of decoded arrays that is always allowed, however small the archive is. [`SCRATCH_PER_BYTE`] bytes per
-/// byte of the archive are allowed in addition.
+/// Number of bytes of decoded arrays that are allowed for any archive, however small it is; see [`SCRATCH_PER_BYTE`].
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
 /// Largest possible ratio of decompressed to compressed bytes with DEFLATE.
 const MAX_DEFLATE_FACTOR: u64 = 1032;
@@ -63,9 +63,9 @@ pub(crate) struct NpzArray {
     stored: u64,
     /// Index of the array among the files of the archive.
     index: usize,
-    /// Length in bytes of the array's header. `start` is the offset in the archive of the first value; it has a meaning
-    /// only if the array is not compressed.
+    /// Length in bytes of the array's header.
     header: usize,
+    /// Byte offset, in the archive, of the first value; meaningless if the array is compressed.
     start: usize,
 }
 
@@ -123,7 +123,7 @@ impl NpzArray {
         self.shape.iter().product()
     }
 
-    /// Returns the offset in bytes of the values in the file; meaningless if they are compressed.
+    /// Returns the byte offset, in the archive, of the first value; meaningless if the array is compressed.
     pub(crate) fn start(&self) -> usize {
         self.start
     }
@@ -194,7 +194,8 @@ impl Npz {
     /// Checks the headers of the arrays called `names`, without decoding values:
     ///
     /// - Each array exists and holds floating-point numbers in C order (last axis fastest).
-    /// - Decoding them takes at most as much scratch space as is allowed for an archive of this length.
+    /// - The decoded arrays together do not take more scratch space than the limit for this archive
+    ///   ([`SCRATCH_PER_BYTE`]).
     ///
     /// # Errors
     /// Fails if one of these conditions does not hold; the message names the array.

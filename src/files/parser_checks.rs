@@ -19,8 +19,8 @@ pub fn check_pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     Some(described)
 }
 
-/// Fuzzing entry point for the JSON reader of camera files: reads `bytes` once without the lists, and once for each of
-/// the ways in which the image lists of camera files are read. Returns the number of values found.
+/// Fuzzing entry point for the JSON reader of camera files: reads `bytes` once without the lists of images, and once
+/// for each kind of list of images that camera files have. Returns the number of values found.
 ///
 /// # Errors
 /// Fails if the text is not JSON or exceeds the limits on strings, numbers and nesting.

@@ -49,7 +49,7 @@ pub(crate) struct Argument {
     pub(crate) place: Range<usize>,
 }
 
-/// Parse error: byte at which parsing stopped, and a description of the token expected there.
+/// Parse error: byte offset in the text at which parsing stopped, and a description of the token expected there.
 #[derive(Debug, PartialEq)]
 pub(crate) struct ParseError {
     byte: usize,

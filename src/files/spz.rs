@@ -66,8 +66,8 @@ pub struct SpzErrors {
     /// - The scale is above the maximum that the format can store. The file then stores this maximum.
     /// - The maximum is smaller than the scale by more than 1/10 of the scale.
     ///
-    /// Such a scale is allowed, because the maximum is still at least ten times as large as the scene. If the maximum
-    /// is smaller than that, [`write_spz`] fails.
+    /// Such a scale is allowed if the maximum is still at least ten times the distance from the Gaussian to the far
+    /// side of the scene. Otherwise [`write_spz`] fails.
     pub reduced_scales: usize,
 }
 
@@ -212,7 +212,7 @@ fn scale_of_byte(byte: u8) -> f64 {
     (f64::from(byte) / 16.0 - 10.0).exp()
 }
 
-/// Returns the errors (original minus stored value) of an `.spz` file of the Gaussians `state`. `unit` is the unit in
+/// Returns the errors of the values that an `.spz` file would store for the Gaussians `state`. `unit` is the unit in
 /// which positions are stored, in scene units.
 ///
 /// # Errors
@@ -281,9 +281,9 @@ fn sh_byte(k: usize, value: f32) -> u8 {
     ((rounded + 128 + half) >> dropped_bits << dropped_bits).clamp(0, 255) as u8
 }
 
-/// Encodes a unit quaternion xyzw in 32 bits: the index of the component with the largest magnitude, and the values of
-/// the other three components. The omitted component is taken as positive, which is possible because q and −q are the
-/// same rotation.
+/// Encodes a unit quaternion xyzw in 32 bits: the index of the component with the largest magnitude, and the sign and
+/// magnitude of each of the other three components. A decoder takes the omitted component as positive. If it is
+/// negative, the stored signs are therefore reversed; q and −q are the same rotation.
 fn smallest_three(q: [f64; 4]) -> u32 {
     let largest = (1..4).fold(0, |largest: usize, i| if q[i].abs() > q[largest].abs() { i } else { largest });
     let others = (0..4).filter(|&i| i != largest);

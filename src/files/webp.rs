@@ -44,9 +44,9 @@ impl RgbaImage {
     /// Decodes a lossless WebP file. Images without an alpha channel get an alpha of 255.
     ///
     /// # Errors
-    /// Returns a description of what was found, for an error message, if `bytes` are not a still lossless WebP, if they
-    /// are damaged, or if the image has more than `max_pixels` pixels. The number of pixels is checked before memory is
-    /// allocated for them.
+    /// Fails if `bytes` are not a still lossless WebP, if they are damaged, or if the image has more than `max_pixels`
+    /// pixels. The error is a description of the content found, for a message. The number of pixels is checked before
+    /// memory is allocated for them.
     pub fn from_webp(bytes: &[u8], max_pixels: usize) -> Result<RgbaImage, String> {
         let described = |error: DecodingError| format!("a file that cannot be decoded ({error})");
         let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(described)?;

@@ -27,8 +27,8 @@ impl<W: Write + Seek> ZipOutput<W> {
         self.failed.map_or(Ok(()), Err)
     }
 
-    /// Calls `done` with the inner output and returns its result. If this call fails or an earlier one failed, returns
-    /// `fallback` instead. The first error is kept for [`ZipOutput::close`].
+    /// Calls the operation `done` with the inner output and returns its result. If the operation or an earlier one
+    /// failed, returns `fallback` instead. The first error is kept for [`ZipOutput::close`].
     fn unless_failed<T>(&mut self, fallback: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
         if self.failed.is_some() {
             return fallback;

@@ -27,11 +27,11 @@ use crate::model::{Camera, Rig, Split};
 const MAX_NAME_BYTES: u64 = 4096;
 /// Bytes of one 2D point in an image entry: two coordinates (f64) and the number of the 3D point (u64).
 const POINT_BYTES: u64 = 24;
-/// Bytes of memory to count per camera. When the table of cameras grows, it is copied to a table of twice the size, and
-/// both exist for a moment. So this is 4 times the size of an entry.
+/// Estimated memory per camera, in bytes. When the table of cameras grows, it is copied to a table of twice the size,
+/// and both exist for a moment. So this is 4 times the size of an entry.
 const LENS_BYTES: u64 = 4 * size_of::<(u32, Lens)>() as u64;
-/// Bytes of memory to count per image, without its name. When the list of images grows, it is copied to a list of twice
-/// the length, and both exist for a moment. So this is 3 times the size of an element, and 160 bytes in addition.
+/// Estimated memory per image without its name, in bytes. When the list of images grows, it is copied to a list of
+/// twice the length, and both exist for a moment. So this is 3 times the size of an element, plus 160 bytes.
 const IMAGE_BYTES: u64 = 3 * size_of::<ColmapImage>() as u64 + 160;
 /// Maximum difference between 1 and the length of the quaternion of a rotation.
 const UNIT_TOLERANCE: f64 = 1e-3;
@@ -299,8 +299,7 @@ impl<'a> Binary<'a> {
         Ok(Binary { path, file: BufReader::new(file), at: 0, len })
     }
 
-    /// Returns an error that says which content was `expected` at the present position of the file, and which was
-    /// `found`.
+    /// Returns the error for a file in which `found` is at the present position instead of `expected`.
     fn wrong(&self, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(self.path, format!("byte {}", self.at), expected, found)
     }

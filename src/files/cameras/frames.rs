@@ -42,8 +42,8 @@ pub(super) fn count(root: &Path, first: u32) -> usize {
     (first..=u32::MAX).take_while(|k| root.with_file_name(format!("{PREFIX}{k}")).is_dir()).count()
 }
 
-/// Returns the images of all frames of a data set with one folder `colmap_K` per frame. There are `frames` frames, each
-/// with the cameras of the first frame.
+/// Returns the images of all `frames` frames of a data set with one folder `colmap_K` per frame. Every frame has the
+/// cameras of the first frame.
 ///
 /// - `images` are the images of the first frame.
 /// - `root` is the folder `colmap_K` of the first frame, and `first` its number K. The folder of each later frame has

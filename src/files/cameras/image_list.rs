@@ -47,8 +47,8 @@ pub(super) fn read_keys(file: &Path, wanted: &[&str]) -> Result<SmallValue> {
     read(file, &ParseAbort::default(), Keep { wanted, elements: MAX_ELEMENTS })
 }
 
-/// Calls `take` with the index and the content of every element of the list under `key`, or of the document itself if
-/// `key` is `None`. Of each element only the keys `wanted` are read.
+/// Calls `take` with the index and the content of every element of the list under `key`. If `key` is `None`, the list
+/// is the document itself. Of each element only the keys `wanted` are read.
 ///
 /// # Errors
 /// Fails if `take` fails, if a key occurs twice, or if the file is not valid JSON.

@@ -40,11 +40,11 @@ pub(super) fn is_meta_json(outline: &SmallValue) -> bool {
 pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<Rig> {
     let split = |path: &Path| FILES.iter().find(|(name, _)| path.ends_with(name)).map_or(Split::Train, |found| found.1);
     let mut assembly = Assembly::new(memory);
-    let frames = add(&mut assembly, file, split(file))?;
+    let frames = add_file(&mut assembly, file, split(file))?;
     for (name, split) in FILES.iter().filter(|(name, _)| with_others && !file.ends_with(name)) {
         let other = file.with_file_name(name);
         if other.is_file() {
-            let found = add(&mut assembly, &other, *split)?;
+            let found = add_file(&mut assembly, &other, *split)?;
             if found != frames {
                 let expected = format!("{frames} frames, as in {}", file.shown());
                 return Err(Error::input(&other, "k", expected, format!("{found} frames")));
@@ -68,7 +68,7 @@ impl<T> KeyedValues<T> {
     /// Table without any frames.
     const EMPTY: KeyedValues<T> = KeyedValues { values: Vec::new(), ends: Vec::new() };
 
-    /// Bytes of memory to count per value of a table. When the list of values grows, it is copied to a list of twice
+    /// Estimated memory per value of a table, in bytes. When the list of values grows, it is copied to a list of twice
     /// the length, and both exist for a moment. So this is 3 times the size of a value.
     const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
 
@@ -127,7 +127,7 @@ impl Tables {
 }
 
 /// Adds the images that `file` lists to `assembly`, as images of `split`. Returns the number of frames of the file.
-fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
+fn add_file(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
     let (width, height) = (shared.side("w")?, shared.side("h")?);

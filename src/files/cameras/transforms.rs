@@ -48,7 +48,7 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
     files.sort_by_key(|file| split_of(file) as u8);
     let mut assembly = Assembly::new(options.memory);
     for file in &files {
-        add(&mut assembly, file, options)?;
+        add_file(&mut assembly, file, options)?;
     }
     let latest = assembly.latest(latest);
     if latest > 0.0 && options.clock == TimeConvention::Normalized {
@@ -93,7 +93,7 @@ fn latest_in(file: &Path) -> Result<f64> {
 }
 
 /// Adds the images listed in `file` to `assembly`.
-fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
+fn add_file(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
     assembly.begin(file, shared.list_len("frames")?)?;

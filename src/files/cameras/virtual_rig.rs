@@ -64,8 +64,8 @@ const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 /// sphere. All of them are training views.
 ///
 /// - `weights` holds the visible area of each Gaussian: its opacity times the product of its two larger scales. So
-///   floaters, which are many and thin, count little. Weights above the 99th percentile are set to it, so that a
-///   backdrop of few huge Gaussians does not dominate.
+///   floaters, which are many but have little opacity or area, count little. Weights above the 99th percentile are
+///   reduced to this percentile, so that a backdrop of few huge Gaussians does not dominate.
 /// - The center of the sphere is the weighted median of `positions`, separately for x, y and z.
 /// - The radius of the surface is the distance from the center within which nine tenths of the weight lie. The sphere
 ///   has 2.2 times this radius.

@@ -113,7 +113,7 @@ fn every_float_type_is_converted_to_f32() {
 /// Checks that a checkpoint in the format of PyTorch before 1.6 is refused with a message that says how to convert it.
 /// The test bytes are the start of a file that `torch.save(…, _use_new_zipfile_serialization=False)` writes.
 #[test]
-fn files_of_old_pytorch_are_refused_with_the_way_out() {
+fn files_of_old_pytorch_are_refused_with_advice() {
     let start = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.";
     let error = TempCheckpoint::new().open(start).unwrap_err().to_string();
     for part in ["a.pt", "PyTorch 1.6", "the older format", "torch.load('OLD'"] {

@@ -23,7 +23,7 @@ use crate::files::zip_output::ZipOutput;
 /// Alignment of the contents of each file in the archive, in bytes, as in PyTorch.
 const ALIGNMENT: u16 = 64;
 
-/// Tensor with one row per Gaussian, and the rows of it that get new values in the copy of the checkpoint.
+/// Tensor with one row per Gaussian, and new values for some of its rows in the copy of the checkpoint.
 #[derive(Debug)]
 pub(crate) struct GaussianRows {
     /// Tensor in the original checkpoint.

@@ -129,7 +129,7 @@ impl Container {
 
     /// Allows up to `bytes` of decoded tiles to stay in memory as long as the container is open, so that later passes
     /// over the frames do not read the file again. Without this call no tile is kept. The number may be raised at any
-    /// time; a smaller one has no effect. The values read do not depend on it.
+    /// time; a smaller one has no effect. It does not change the values that are read.
     pub fn hold_decoded(&self, bytes: u64) {
         let own = self.slots() as u64 * HeldTiles::BYTES_PER_SLOT;
         if bytes > own {

@@ -14,9 +14,11 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, logit, sh_coefficients};
 
 /// Maximum length in bytes of the JSON text; the text of our own files takes 5 kB.
 const MAX_TEXT_BYTES: usize = 1 << 20;
-/// Minimum opacity, and (`MIN_SCALE`) minimum standard deviation in scene units, of a Gaussian after reading. Smaller
-/// values of the file are raised to the minimum, so that their logarithms are finite.
+/// Minimum opacity of a Gaussian after reading. Opacities of the file are clamped to the range from this value to 1
+/// minus this value, so that their logits are finite.
 const MIN_OPACITY: f64 = 1e-6;
+/// Minimum standard deviation, in scene units, of a Gaussian after reading. Smaller values of the file are raised to
+/// it, so that their logarithms are finite.
 const MIN_SCALE: f64 = 1e-7;
 
 /// Stored values of one attribute of the glTF primitive: `count` values, the first at the start of `bytes`, each

@@ -13,8 +13,9 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::check_positions;
 use crate::model::{Gaussians, color_from_sh, opacity};
 
-/// Number by which glTF denotes the component type f32. `U8` is the one for u8.
+/// Number by which glTF denotes the component type f32.
 const F32: u32 = 5126;
+/// Number by which glTF denotes the component type u8.
 const U8: u32 = 5121;
 
 /// Number of Gaussians whose values of an attribute are written at once.

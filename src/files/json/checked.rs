@@ -35,9 +35,9 @@ pub(super) struct CheckedReader<R> {
     file: R,
     path: PathBuf,
     buffer: Vec<u8>,
-    /// Number of bytes at the start of the buffer that the parser has taken. `checked` is the number of bytes at the
-    /// start of the buffer that have been checked.
+    /// Number of bytes at the start of the buffer that the parser has taken.
     taken: usize,
+    /// Number of bytes at the start of the buffer that have been checked.
     checked: usize,
     /// Number of bytes of the buffer that have been read from the file. All of them have been checked, except up to 3
     /// bytes of an incomplete character at their end.

@@ -17,14 +17,14 @@ pub(crate) struct ElementPosition {
     /// Index in [`ListSelection::keys`] of the key of the list; 0 if the document itself is the list.
     pub(crate) key: usize,
     /// Index of the element in the list. If the key of the list occurs several times in the document, the index starts
-    /// at 0 again for each of these lists. Only the last one is valid, as for any repeated key.
+    /// at 0 again for each of these lists. As for any repeated key in JSON, only the last of these lists is valid.
     pub(crate) index: usize,
-    /// Index of the element in the inner list, if lists of lists are read (see [`ListSelection::nested`]). `None` in
-    /// these cases:
+    /// Index of the element in the inner list, if lists of lists are read (see [`ListSelection::nested`]). It is `None`
+    /// in these calls:
     ///
-    /// - Only the outer list is read.
-    /// - The element of the outer list is not a list. The value is this element.
-    /// - An inner list has ended. The value is an empty list.
+    /// - Only the outer list is read: the value is an element of this list.
+    /// - The element of the outer list is not a list: the value is this element.
+    /// - The call marks the end of an inner list, after the calls for its elements: the value is an empty list.
     pub(crate) inner: Option<usize>,
 }
 

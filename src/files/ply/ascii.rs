@@ -12,11 +12,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::header::{Element, PlyHeader, Property, Scalar};
 use crate::error::{Error, Result, quoted};
 
-/// Constant part of the maximum length of a line of a text PLY file, in bytes. The maximum grows by
-/// [`LINE_BYTES_PER_NUMBER`] with each number in the line.
+/// Constant part of the maximum length in bytes of a line of a text PLY file. The maximum for a line of n numbers is
+/// `LINE_BYTES` + [`LINE_BYTES_PER_NUMBER`] · n.
 const LINE_BYTES: u64 = 1 << 20;
-/// Number of bytes by which the maximum length of a line of a text PLY file grows with each number in the line. The
-/// longest usual form of an f64 has 24 characters.
+/// Number of bytes that each number in a line of a text PLY file adds to the maximum length of the line. The longest
+/// usual form of an f64 has 24 characters.
 const LINE_BYTES_PER_NUMBER: u64 = 64;
 
 /// Unnamed scratch file that holds the rows of any number of text PLY files in binary form. Created when the first text

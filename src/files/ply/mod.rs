@@ -286,8 +286,8 @@ impl Ply {
         Ok(Some(values))
     }
 
-    /// Returns the number of bytes to count as read, in statistics, when `rows` Gaussians of this file are read: the
-    /// size of their rows. For a text file it is always the length of the whole file.
+    /// Returns the number of bytes that statistics count as read when `rows` Gaussians of this file are read: the size
+    /// of their rows. For a text file it is always the length of the whole file.
     pub(crate) fn bytes_read_for(&self, rows: usize) -> u64 {
         match &self.body.text {
             None => (rows * self.stride) as u64,

@@ -71,9 +71,9 @@ pub fn write_like_template(
     let sources: Vec<u32> = rows.iter().map(|row| row.source).collect();
     write_rows_like(template, &sources, name, path, |place, bytes| {
         if let Some(proxy) = rows[place].proxy {
-            replace(bytes, template.layout(), big_endian, proxies, proxy as usize);
+            replace_attributes(bytes, template.layout(), big_endian, proxies, proxy as usize);
         }
-        add(bytes, template, change, place);
+        add_delta(bytes, template, change, place);
     })
 }
 
@@ -240,7 +240,7 @@ pub(crate) fn write_rows(
                 row[range.clone()].copy_from_slice(own);
                 rest = after;
             }
-            replace(&mut row, &layout, big_endian, cloud, i);
+            replace_attributes(&mut row, &layout, big_endian, cloud, i);
             out.write_all(&row)?;
         }
         out.write_all(tail)
@@ -297,10 +297,10 @@ fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &
     Ok(())
 }
 
-/// Replaces the attributes of one output row by those of the proxy with index `proxy` in `proxies`. (A proxy is a
-/// Gaussian that replaces a merged cluster.) `row` holds the bytes of the row, `layout` locates the attributes in it,
+/// Replaces the attributes of one output row by those of the Gaussian with index `proxy` in `proxies`, such as a proxy
+/// (Gaussian that replaces a merged cluster). `row` holds the bytes of the row, `layout` locates the attributes in it,
 /// and `big_endian` states the byte order.
-fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
+fn replace_attributes(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
     for column in Attributes::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {
             if let PlaneSource::Property(property) = plane {
@@ -312,7 +312,7 @@ fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gauss
 
 /// Adds a parameter delta to the bytes `row` of one output row, which has the layout of `template`. `change` holds the
 /// deltas (changes of the stored values) of all output rows, and `place` is the index of this row.
-fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
+fn add_delta(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     for column in change.attributes().iter() {
         let by = change.0.column(column);

@@ -29,7 +29,7 @@ pub struct ImageSize {
 
 impl ImageSize {
     /// Returns the size of nearly square images with a pixel for each of `count` Gaussians, both sides multiples of 4;
-    /// `None` if such images would be larger than a WebP can be.
+    /// `None` if a side would be 16384 pixels ([`MAX_SIDE`]) or more.
     pub fn for_count(count: usize) -> Option<ImageSize> {
         let width = 4 * ((count as f64).sqrt() / 4.0).ceil().max(1.0) as usize;
         let height = 4 * count.div_ceil(width).div_ceil(4).max(1);

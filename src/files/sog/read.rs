@@ -23,15 +23,15 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// Maximum length in bytes of `meta.json`; three codebooks take about 20 kB.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Maximum number of files in a `.sog` archive. `MAX_LIST_BYTES` is the maximum length in bytes of the list of these
-/// files.
+/// Maximum number of files in a `.sog` archive.
 const MAX_ENTRIES: u64 = 1024;
+/// Maximum length in bytes of the list of files at the end of a `.sog` archive.
 const MAX_LIST_BYTES: u64 = 4 << 20;
 /// Bytes of memory per pixel while an image is decoded: the image and the buffers of the decoder.
 const BYTES_PER_PIXEL: u64 = 16;
 /// Maximum number of large images (those with one pixel per Gaussian) that are in memory at the same time while a file
 /// is read.
-const IMAGES: u64 = 6;
+const MAX_LARGE_IMAGES: u64 = 6;
 /// Maximum number of pixels of the image that holds the palette of SH coefficients: 65536 entries with 15 pixels each,
 /// one per coefficient of degrees 1 to 3.
 const MAX_PALETTE_PIXELS: usize = 15 << 16;
@@ -62,7 +62,7 @@ pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLi
         return Err(Error::input(path, "meta.json, count", "at most 4294967295", meta.count.to_string()));
     }
     let widest = 4 * 3 * sh_coefficients(MAX_SH_DEGREE) as u64 + 4 * 11;
-    let per_gaussian = widest + IMAGES * BYTES_PER_PIXEL;
+    let per_gaussian = widest + MAX_LARGE_IMAGES * BYTES_PER_PIXEL;
     memory.check(path, "meta.json, count", "the Gaussians of the file", meta.count.saturating_mul(per_gaussian))?;
     let mut of_gaussians = |name: &str| files.image_of_gaussians(path, name, count, memory);
     let [low, high] = [of_gaussians(&meta.means.files[0])?, of_gaussians(&meta.means.files[1])?];

@@ -26,9 +26,9 @@ use crate::model::{Gaussians, color_from_sh, opacity};
 /// Largest magnitude of ln s that is stored, where s is a scale in scene units. Gaussians with ln s below −20 are
 /// smaller than any pixel, those with ln s above 20 larger than any scene.
 const MAX_LOG_SCALE: f32 = 20.0;
-/// Maximum number of palette entries of a file with fewer than 2048 Gaussians. Larger files may have more (see
-/// [`palette_entries`]).
-const LEAST_PALETTE: usize = 1024;
+/// Lower bound of the maximum number of palette entries of a file: files with fewer than 2048 Gaussians may have this
+/// many. Larger files may have more (see [`palette_entries`]).
+const MIN_PALETTE_LIMIT: usize = 1024;
 
 /// Errors of a written file: differences between the Gaussians and the values in the file.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -212,6 +212,6 @@ fn encode_sh(
 /// Returns the maximum number of palette entries for a file of `count` Gaussians: the largest power of two that is at
 /// most `count`, but at least 1024 and at most 65536.
 fn palette_entries(count: usize) -> usize {
-    let doublings = (count / LEAST_PALETTE).max(1).ilog2().min(6);
-    LEAST_PALETTE << doublings
+    let doublings = (count / MIN_PALETTE_LIMIT).max(1).ilog2().min(6);
+    MIN_PALETTE_LIMIT << doublings
 }

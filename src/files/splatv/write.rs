@@ -31,7 +31,7 @@ const TEXELS_PER_GAUSSIAN: usize = 4;
 /// - Values beyond the range of half precision become the largest finite value; NaN becomes 0.
 /// - The quaternion and its rate of change must not both be stored as 0, because players divide by the length of the
 ///   quaternion. If both are so small that half precision turns them into 0, both are first divided by the length of
-///   the quaternion. If this length cannot be divided by (0, NaN or subnormal), the quaternion becomes the identity.
+///   the quaternion. If this length is 0, NaN or subnormal, the quaternion becomes the identity instead.
 pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();

@@ -199,7 +199,8 @@ fn is_f32(value: f64) -> bool {
 
 /// Returns the number of frames, the frame rate and the mapping of times of an archive. `meta` is the content of its
 /// `meta.json`, and `timeline` says when the Gaussians are visible. The mapping converts times of the original sequence
-/// to the times of players, from 0 to 1. If `meta` does not state the original times, it leaves times unchanged.
+/// to the times of players, from 0 to 1. If `meta` does not state the original times, the mapping leaves times
+/// unchanged.
 fn clip_times(meta: &TsogMeta, timeline: Timeline, path: &Path) -> Result<ClipTimes> {
     let playback = meta.playback.as_ref();
     let number = |name: &str, value: Option<f64>| match value {

@@ -21,9 +21,9 @@ const MAX_DEVIATION: f64 = 8.0;
 const MAX_OPACITY: f64 = 1.0 - 1e-6;
 /// Maximum number of frames of a timeline of type 0, in which each Gaussian is seen in a single frame.
 pub const MAX_FRAMES: usize = 1 << 16;
-/// Largest position errors with which velocities are stored with 8 bits; with larger errors they are stored with 16
-/// bits. The first number is the root of the mean squared error over all Gaussians, the second the largest error. The
-/// unit is the middle one of a Gaussian's three scales.
+/// Maximum position errors that rounding velocities to 8 bits may cause; if one of them is exceeded, velocities are
+/// stored with 16 bits. The first number is the root of the mean squared error over all Gaussians, the second the
+/// largest error. The unit is the middle one of a Gaussian's three scales.
 const MAX_8_BIT_ERRORS: [f64; 2] = [0.03, 0.25];
 
 /// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`. Returns the
