@@ -22,9 +22,13 @@ const MIN_THICKNESS: f64 = 0.1;
 /// different thresholds.
 #[derive(Debug, Clone, Copy)]
 pub struct AppearanceThresholds {
+    /// Maximum Mahalanobis distance of the two centers, under the mean of the two covariances; exclusive.
     d0: f64,
+    /// Minimum cosine between the base colors (SH coefficients of degree 0); exclusive.
     rho: f64,
+    /// Maximum difference of the largest, of the middle and of the smallest log scale.
     max_log_scale_ratio: f64,
+    /// Maximum distance of the base colors in RGB, where 1 is full intensity.
     max_color_difference: f64,
 }
 
@@ -57,8 +61,11 @@ pub struct Appearance {
     /// Natural logarithms of the scales, descending. For the comparison of sizes the smallest scale is raised to at
     /// least [`MIN_THICKNESS`] times the middle one.
     log_scale: [f64; 3],
+    /// Standard deviations along the axes of `rotation`, in scene units.
     scales: DVec3,
+    /// SH coefficients of degree 0: red, green, blue.
     dc: DVec3,
+    /// Base color as red, green and blue, with negative values raised to 0.
     color: DVec3,
 }
 
@@ -104,15 +111,15 @@ fn are_sizes_alike(a: [f64; 3], b: [f64; 3], max_log_ratio: f64) -> bool {
     (0..3).all(|c| (a[c] - b[c]).abs() <= max_log_ratio)
 }
 
-/// Returns the cosine (a·b)/(‖a‖‖b‖ + [`COSINE_EPSILON`]), in [−1, 1]. Equal vectors of any length give 1, so that
-/// copies of a medium gray Gaussian, whose color coefficients are all zero, count as alike.
+/// Returns the cosine (a·b)/(‖a‖‖b‖ + [`COSINE_EPSILON`]), in [−1, 1]. Returns 1 for equal vectors, even if they are
+/// zero: two copies of a medium gray Gaussian have only zero color coefficients, and count as alike.
 fn cosine(a: DVec3, b: DVec3) -> f64 {
     if a == b { 1.0 } else { a.dot(b) / (a.length() * b.length() + COSINE_EPSILON) }
 }
 
-/// Returns the Mahalanobis distance √(Δᵀ (Σ + 1e-6 tr Σ)⁻¹ Δ) of the offset Δ = `delta` under the positive semidefinite
-/// covariance Σ = `sigma`. Divides Σ by its trace before the Cholesky factorization in f64, so that the squares of
-/// scales between 1e-12 and 1e6 stay in range. For Σ = 0 the distance is 0 if Δ = 0, else infinite.
+/// Returns the Mahalanobis distance √(Δᵀ (Σ + 1e-6 · tr(Σ) · I)⁻¹ Δ) of the offset Δ = `delta` under the positive
+/// semidefinite covariance Σ = `sigma`. Divides Σ by its trace before the Cholesky factorization in f64, so that the
+/// squares of scales between 1e-12 and 1e6 stay in range. For Σ = 0 the distance is 0 if Δ = 0, else infinite.
 fn mahalanobis(delta: DVec3, sigma: &DMat3) -> f64 {
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
     if trace == 0.0 {

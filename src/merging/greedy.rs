@@ -17,9 +17,9 @@ use rayon::prelude::*;
 /// after the last round are assigned sequentially. Scenes need 5 to 8 rounds. A chain of Gaussians that are ranked in
 /// their order along a line would need one round for every two Gaussians.
 const MAX_ROUNDS: usize = 32;
-/// Number of nodes (Gaussians or merged groups) below which it is faster to assign them to their leaders (the nodes
-/// that they join) sequentially than in another parallel round.
-const FEW: usize = 64;
+/// Maximum number of undecided nodes (Gaussians or merged groups) that are assigned to their leaders sequentially at
+/// the end. For so few nodes another parallel round would take longer.
+const MAX_SEQUENTIAL_NODES: usize = 64;
 
 /// Result of clustering: for every node (Gaussian or merged group) its leader, which is the node that it joins or
 /// itself, and statistics of how the leaders were found.
@@ -33,8 +33,8 @@ pub struct Clustering {
     /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
     /// they join).
     pub rounds: usize,
-    /// Whether some nodes (Gaussians or merged groups) were assigned to leaders (the nodes that they join)
-    /// sequentially, after the last parallel round.
+    /// Whether more than 64 nodes (Gaussians or merged groups) had no leader after the last of 32 parallel rounds, so
+    /// that many nodes were assigned sequentially.
     pub sequential: bool,
 }
 
@@ -73,7 +73,7 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
     let mut leader_of = vec![UNDECIDED; rank.len()];
     let mut undecided: Vec<u32> = (0..rank.len() as u32).collect();
     let mut rounds = 0;
-    while undecided.len() > FEW && rounds < MAX_ROUNDS {
+    while undecided.len() > MAX_SEQUENTIAL_NODES && rounds < MAX_ROUNDS {
         let decisions: Vec<Option<u32>> =
             undecided.par_iter().map(|&node| predecessors.decide(node, &leader_of)).collect();
         for (&node, decision) in undecided.iter().zip(&decisions) {
@@ -84,7 +84,7 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
         undecided.retain(|&node| leader_of[node as usize] == UNDECIDED);
         rounds += 1;
     }
-    let sequential = undecided.len() > FEW;
+    let sequential = undecided.len() > MAX_SEQUENTIAL_NODES;
     undecided.sort_unstable_by_key(|&node| rank[node as usize]);
     for node in undecided {
         // Every predecessor (node that could take this one) is decided by now, so `decide` always returns a leader.
@@ -94,8 +94,7 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
     Clustering { leader_of, joins, rounds, sequential }
 }
 
-/// For every node (Gaussian or merged group), the nodes of lower rank that it could join (that could become its
-/// leader).
+/// For every node (Gaussian or merged group), its possible leaders: the nodes of lower rank that it could join.
 struct Predecessors {
     start: Vec<usize>,
     /// Pairs (possible leader, node). A node is a Gaussian or a merged group. It may join the possible leader, a node
@@ -132,8 +131,9 @@ impl Predecessors {
     }
 }
 
-/// Undoes all joins in `leader_of` except the first `limit`, ordered by the `rank` of the leader (node that another
-/// joins), then of the node that joins it. Without `limit`, undoes none. Returns the number of joins that remain.
+/// Keeps only the first `limit` joins in `leader_of`, and undoes all others. Joins are ordered by the `rank` of the
+/// leader, then by the rank of the node that joins it. Without `limit`, keeps all joins. Returns the number of joins
+/// that remain.
 fn truncate(rank: &[u32], leader_of: &mut [u32], limit: Option<usize>) -> usize {
     let joined = |(node, &leader): (usize, &u32)| (node as u32 != leader).then_some(node as u32);
     let all = leader_of.iter().enumerate().filter_map(joined).count();

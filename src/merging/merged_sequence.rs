@@ -19,8 +19,8 @@ use crate::recipe::{MergeParams, ProxyPosition};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Attributes of a proxy (Gaussian that replaces a merged cluster) that are always computed together: all except SH.
-/// Position, rotation and scale follow from the moments (mean and covariance) of the members, and the opacity from
-/// their areas.
+/// Position, rotation and scale follow from mean and covariance of the members; the opacity follows from the members'
+/// opacities and areas.
 const MIXED: Attributes = Attributes::all().difference(Attributes::SH);
 
 /// Number of proxies (Gaussians that replace merged clusters) that are computed before their values are written to the
@@ -73,10 +73,11 @@ impl<'a> MergedSequence<'a> {
 
 impl MergedSequence<'_> {
     /// Opens a reader of the Gaussians with the indices `places` in this sequence, at the frames `wanted`. A proxy
-    /// (Gaussian that replaces a merged cluster) is computed from its members (the Gaussians of the cluster); the
+    /// (Gaussian that replaces a merged cluster) is computed from its members, the Gaussians of the cluster. The
     /// members of all proxies among `places` are read together, on all threads. Fails if a Gaussian cannot be read.
     ///
-    /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
+    /// Memory for each Gaussian that is read, members of proxies included: its reader, its state at one frame, and 24
+    /// bytes.
     pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
         let inputs = MergedMembers::new(self, places);
         let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Attributes::all(), wanted)?;
@@ -147,9 +148,8 @@ impl MergedMembers {
         MergedMembers { ids, rows, proxies, members }
     }
 
-    /// Returns the attributes of the source Gaussians that are needed to compute the attributes `want` of the selected
-    /// Gaussians. If some of these are proxies (Gaussians that replace clusters), [`MIXED`] is needed in addition to
-    /// `want`.
+    /// Returns the attributes that must be read from the source to compute the attributes `want` of the selected
+    /// Gaussians. These are `want` and, if a selected Gaussian is a proxy (which replaces a cluster), also [`MIXED`].
     fn needed(&self, want: Attributes) -> Attributes {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }

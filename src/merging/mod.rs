@@ -9,11 +9,14 @@
 //! Input: the states of the survivors (Gaussians left by pruning) at the reference frame, and a callback that measures
 //! the motion of pairs. Output: groups of survivors, and the state of one proxy for each group of more than one.
 //!
-//! Peak memory per survivor: its state, held by the caller; the proxy states before and after a pass (each at most half
-//! as many as survivors); and [`BYTES_PER_SURVIVOR`]. To this add [`BYTES_PER_PAIR`] for each candidate pair that is
-//! measured in one call, and [`BYTES_PER_PASSED_PAIR`] for each pair that passed all tests. There are at most
-//! `max_neighbors` pairs per survivor; 3.5 were measured for evenly distributed Gaussians. The memory of the callback
-//! is not included.
+//! Peak memory per survivor:
+//! - its state, which the caller holds;
+//! - the proxy states before and after a pass (in each of these two tables, at most one proxy for every two survivors);
+//! - [`BYTES_PER_SURVIVOR`] for everything else.
+//!
+//! In addition, memory holds [`BYTES_PER_PAIR`] for each candidate pair that is measured in one call, and
+//! [`BYTES_PER_PASSED_PAIR`] for each pair that passed all tests. There are at most `max_neighbors` pairs per survivor;
+//! 3.5 were measured for evenly distributed Gaussians. The memory of the callback is not included.
 
 pub mod appearance;
 pub mod greedy;
@@ -43,8 +46,8 @@ use similarity_cache::BYTES_PER_CACHED_PAIR;
 use tree::TreePoint;
 
 /// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. The terms are, in
-/// order: the groups before the pass, the groups after it, the row of the survivor's state, its rank, and the largest
-/// of three structures of which only one exists at a time. These are the neighbor index (46 bytes), the list of
+/// order: the groups before the pass, the groups after it, the row of the survivor's state, its rank, and 46 bytes for
+/// the largest of three structures that exist one after the other. These are the neighbor index (46 bytes), the list of
 /// coincident nodes (24), and the clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
@@ -87,8 +90,8 @@ pub struct RequestedPairs<'a> {
     row: &'a [u32],
     /// Maximum distance ε of the two nodes of a pair at the reference frame, in scene units.
     pub max_distance: f64,
-    /// Whether these are only some of the pairs to be measured: all pairs were too many for one call of the callback
-    /// that measures motion, so they are divided among several calls.
+    /// Whether all pairs to be measured were too many for one call of the callback that measures motion. The pairs of
+    /// this call are then only a part of them; other calls request the others.
     pub is_part: bool,
 }
 
@@ -126,8 +129,8 @@ pub struct PassCounts {
     /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
     /// they join). Nodes without a leader after the last round are assigned sequentially and not counted here.
     pub rounds: usize,
-    /// Whether some nodes (Gaussians or merged groups) were assigned to leaders (the nodes that they join)
-    /// sequentially, after the last parallel round.
+    /// Whether, after the last of 32 parallel rounds, more than 64 nodes (Gaussians or merged groups) had no leader yet
+    /// (node that they join), so that many nodes were assigned sequentially.
     pub sequential: bool,
 }
 
@@ -145,9 +148,9 @@ pub struct PassCounts {
 ///
 /// # Calls of `measure`
 ///
-/// Each pass calls `measure` at most twice: for the pairs of coincident nodes, then for the pairs of neighbors. A call
-/// without pairs is omitted. A call for more than `most_pairs` pairs is replaced by several calls for at most
-/// `most_pairs` pairs each. Pairs of neighbors are ordered by the voxel that contains their leader.
+/// Each pass calls `measure` at most twice: first for the pairs of coincident nodes, then for the pairs of neighbors.
+/// There is no call without pairs. More than `most_pairs` pairs are divided among several calls of at most `most_pairs`
+/// pairs each. Pairs of neighbors are ordered by the voxel that contains their leader.
 ///
 /// # Groups as nodes
 ///
@@ -229,8 +232,8 @@ fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     greedy::ranks(&sizes, &hashes)
 }
 
-/// Nodes of one merging pass: single Gaussians, and groups merged in earlier passes, each with its proxy (merged
-/// Gaussian).
+/// Nodes of one merging pass: single Gaussians, and groups that earlier passes merged. A group has the state of its
+/// proxy, the Gaussian that replaces it.
 struct MergeNodes<'a> {
     survivors: &'a Survivors<'a>,
     groups: &'a MergeGroups,
@@ -298,8 +301,8 @@ impl<'a> MergeNodes<'a> {
 /// 1), and whether the pairs are divided among several calls.
 ///
 /// This step is needed because the neighbor search returns only a fixed number of nearest Gaussians. If more Gaussians
-/// than that coincide, each of them finds only neighbors that coincide with it. Without this step, they would not all
-/// merge into one, and would not find the other Gaussians around them.
+/// than that coincide, each of them finds only neighbors that coincide with it. Without this step, the coincident
+/// Gaussians would not all merge into one, and would find none of the other Gaussians around them.
 ///
 /// # Errors
 /// Returns the first error of `take`.

@@ -1,12 +1,13 @@
 //! Moment matching: computes the single Gaussian that has the weighted mean and covariance of several Gaussians.
 //!
-//! Input: weighted ellipsoids. Output: one ellipsoid. Memory: 96 bytes per input ellipsoid. The covariance Σ = Σ_i w_i
-//! (R_i S_i S_iᵀ R_iᵀ + (μ_i − μ)(μ_i − μ)ᵀ), where w is a weight, R a rotation, S a diagonal matrix of scales and μ a
-//! center, is never formed: squaring halves the number of correct digits, and the smallest scale of a needle would lose
-//! its digits first. Its factor F (3 × 4n, Σ = F Fᵀ) is formed instead; it has the columns √w_i R_i S_i and √w_i (μ_i −
-//! μ). A one-sided Jacobi SVD rotates the three rows of F until they are orthogonal (Demmel and Veselić, "Jacobi's
-//! method is more accurate than QR", 1992). Every rotation is exact to rounding in each column, so a column a billion
-//! times shorter than another keeps its digits.
+//! Input: weighted ellipsoids. Output: one ellipsoid. Memory: 96 bytes per input ellipsoid.
+//!
+//! The covariance is Σ = Σ_i w_i (R_i S_i S_iᵀ R_iᵀ + (μ_i − μ)(μ_i − μ)ᵀ), where w is a weight, R a rotation, S a
+//! diagonal matrix of scales and μ a center. This matrix is never formed: squaring halves the number of correct digits,
+//! and the smallest scale of a needle would lose its digits first. Instead, the factor F (3 × 4n) with Σ = F Fᵀ is
+//! formed. Its columns are √w_i R_i S_i and √w_i (μ_i − μ). A one-sided Jacobi SVD rotates the three rows of F until
+//! they are orthogonal (Demmel and Veselić, "Jacobi's method is more accurate than QR", 1992). Every rotation is exact
+//! to rounding in each column, so a column a billion times shorter than another keeps its digits.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -42,11 +43,12 @@ pub struct Ellipsoid {
 /// Returns the Gaussian that has the mean Σ w_i μ_i and the covariance of the mixture `parts`. If `about` is given, the
 /// mean is that point instead, and the second moments are taken about it.
 ///
-/// Canonical form: scales descend. The first two axes have a positive largest component, and the third makes the frame
-/// right-handed, so a reflection is resolved by flipping the smallest axis. Accuracy: at any anisotropy, every scale
-/// has a relative error of about 1e-14, if the scaled axes of `parts` have errors of this size. Edge cases: without
-/// parts all scales are zero, and the mean is `about` or the origin. Scales must be finite, but may be so large that
-/// their squares overflow.
+/// Canonical form: the scales descend. The component of largest magnitude is positive in each of the first two axes.
+/// The third axis makes the frame right-handed, so a reflection is resolved by flipping the axis of the smallest scale.
+///
+/// Accuracy: at any anisotropy, every scale has a relative error of about 1e-14, if the scaled axes of `parts` have
+/// errors of this size. Edge cases: without parts all scales are zero, and the mean is `about` or the origin. Scales
+/// must be finite, but may be so large that their squares overflow.
 pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     let mean = about.unwrap_or_else(|| parts.iter().map(|part| part.weight * part.position).sum());
     let mut rows: [Vec<f64>; 3] = std::array::from_fn(|_| Vec::with_capacity(4 * parts.len()));
@@ -124,9 +126,9 @@ fn unit_from_axes(frame: &DMat3) -> DQuat {
     if rotation.w < 0.0 { -rotation } else { rotation }
 }
 
-/// Returns `ellipsoid` with its axes permuted and flipped so that its rotation is the nearest to `reference`. There are
-/// 24 such rotations q of the same ellipsoid. The one with the largest |⟨q, reference⟩| is taken, the first one on a
-/// tie. The sign of the quaternion q is the one nearest to `reference`.
+/// Returns `ellipsoid` with its axes reordered and flipped so that its rotation is the nearest to `reference`. There
+/// are 24 such rotations q of the same ellipsoid. The one with the largest |⟨q, reference⟩| is taken, the first one on
+/// a tie. Of the two quaternions of this rotation, the one nearer to `reference` is returned.
 ///
 /// A deformation field adds its deltas axis by axis. So the axes of a merged Gaussian must be in the same order as
 /// those of the Gaussian whose deltas it gets.

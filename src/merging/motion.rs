@@ -2,10 +2,10 @@
 //! frame.
 //!
 //! Input: pairs of nodes (Gaussians or merged groups), then at each frame the position of every node and whether it is
-//! alive. Output: one [`PairMeasure`] per pair, which depends on no threshold. A [`MotionThresholds`] turns it into the
-//! similarity that merging passes compare with their minimum τ_m. Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`]
-//! per node, whatever the number of frames. Each pair is summed by one thread in frame order, so the thread count does
-//! not change the sums.
+//! alive. Output: one [`RelativeMotion`] per pair, which depends on no threshold. [`MotionThresholds::similarity`]
+//! turns it into the motion similarity, which merging passes compare with their minimum τ_m. Memory: [`PAIR_BYTES`] per
+//! pair and [`NODE_BYTES`] per node, whatever the number of frames. Each pair is summed by one thread in frame order,
+//! so the thread count does not change the sums.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -19,11 +19,10 @@ pub const PAIR_BYTES: usize = size_of::<NodePair>();
 /// Bytes of memory that [`PairMotion`] takes for each node (Gaussian or merged group) whose motion it follows.
 pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 
-/// Measured motion of two Gaussians relative to each other. A velocity is a step a = x(t) − x(t−1) between consecutive
-/// frames. It is not divided by the time between the frames, because the noise level with which it is compared is also
-/// that of a step.
+/// Motion of two Gaussians relative to each other. A velocity is a step a = x(t) − x(t−1) between consecutive frames.
+/// It is not divided by the time between the frames, because it is compared with the noise level of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PairMeasure {
+pub struct RelativeMotion {
     /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the steps of the two Gaussians from the previous
     /// frame to this frame. The cosine is 0 if a or b is zero. The mean is over frames in which both Gaussians are
     /// alive (opacity ≥ alpha_min):
@@ -43,16 +42,19 @@ pub struct PairMeasure {
     pub union: u32,
     /// Largest change of the offset between the two Gaussians (difference of their positions) from its value at the
     /// reference frame. In scene units, over the frames in which both Gaussians are alive (opacity ≥ alpha_min). A
-    /// proxy (Gaussian that replaces both) is built from the offset at the reference frame, so it fits other frames
-    /// only if the change is small.
+    /// proxy (Gaussian that replaces both) is built from the offset at the reference frame. It fits other frames only
+    /// if this change is small.
     pub drift: f64,
 }
 
-impl PairMeasure {
-    /// Returns the alignment of the velocities a and b of the two Gaussians over the n steps, A = (2Σ a·b +
-    /// 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]. It is 1 for two static Gaussians. It is the cosine of the angle
-    /// between the velocities for equally fast ones, and small if one is ten times as fast as the other. A is 1 if
-    /// there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
+impl RelativeMotion {
+    /// Returns the alignment of the velocities a and b of the two Gaussians over the n steps,
+    /// A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1].
+    ///
+    /// - For two static Gaussians, A is 1.
+    /// - For two equally fast Gaussians (and σ = 0), A is the cosine of the angle between their velocities.
+    /// - If one is ten times as fast as the other, A is small.
+    /// - Without steps (n = 0), or if neither Gaussian moves and σ = 0, A is 1.
     ///
     /// `noise` is σ, the noise level of a step in scene units.
     pub fn velocity_alignment(&self, noise: f64) -> f64 {
@@ -96,8 +98,8 @@ impl MotionThresholds {
     /// minimum τ_m of the pass. Returns NaN, with which a pair never passes, in three cases:
     /// - the two Gaussians are never alive (opacity ≥ alpha_min) together;
     /// - the fraction of frames with only one alive exceeds its maximum;
-    /// - the change of their offset over time ([`PairMeasure::drift`]) exceeds its maximum.
-    pub fn similarity(&self, pair: &PairMeasure) -> f64 {
+    /// - the change of their offset over time ([`RelativeMotion::drift`]) exceeds its maximum.
+    pub fn similarity(&self, pair: &RelativeMotion) -> f64 {
         let together =
             pair.common > 0 && pair.drift <= self.max_drift && pair.fraction_with_one_alive() <= self.max_dead_time;
         match self.trajectory {
@@ -141,12 +143,13 @@ pub struct PairMotion {
 }
 
 impl PairMotion {
-    /// Starts to measure the motion of each pair of nodes (Gaussians or merged groups), for its [`PairMeasure`].
-    /// `pairs` yields the indices of the two nodes of each pair. `reference` yields the position of every node at the
-    /// reference frame. Frames are added with [`PairMotion::add_frame`]. `motion` selects the steps (from one frame to
-    /// the next) that count:
-    /// - `Literal`: all steps that end in a frame in which both nodes are alive (opacity ≥ alpha_min);
-    /// - `Runs`: only steps that begin and end in such a frame.
+    /// Starts to measure the motion of each pair of nodes (Gaussians or merged groups), for its [`RelativeMotion`].
+    /// Frames are then added with [`PairMotion::add_frame`].
+    /// - `pairs` yields the indices of the two nodes of each pair.
+    /// - `reference` yields the position of every node at the reference frame.
+    /// - `motion` selects the steps (from one frame to the next) that count. With `Literal`, these are all steps that
+    ///   end in a frame in which both nodes are alive (opacity ≥ alpha_min). With `Runs`, a step must begin and end in
+    ///   such a frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -196,15 +199,15 @@ impl PairMotion {
         self.frames += 1;
     }
 
-    /// Returns the [`PairMeasure`] of each pair over all frames added, in the order in which the pairs were given.
-    pub fn finish(self) -> impl ExactSizeIterator<Item = PairMeasure> {
+    /// Returns the [`RelativeMotion`] of each pair over all frames added, in the order in which the pairs were given.
+    pub fn finish(self) -> impl ExactSizeIterator<Item = RelativeMotion> {
         let motion = self.motion;
         let measure = move |pair: NodePair| {
             let terms = match motion {
                 MotionParams::Literal => pair.common,
                 MotionParams::Runs => pair.steps,
             };
-            PairMeasure {
+            RelativeMotion {
                 cosine: if terms == 0 { 0.0 } else { pair.cosines / f64::from(terms) },
                 dot: pair.dot,
                 squares: pair.squares,
@@ -256,7 +259,7 @@ mod tests {
 
     /// Measures a pair of nodes that move along the x axis. `a` and `b` hold the x coordinate of each node at every
     /// frame, and whether it is alive. The reference frame is frame 0.
-    fn measure(a: &Path, b: &Path, motion: MotionParams) -> PairMeasure {
+    fn measure(a: &Path, b: &Path, motion: MotionParams) -> RelativeMotion {
         let state = |t: usize, node: usize| {
             let (x, alive) = [a, b][node][t];
             ([x, 0.0, 0.0], alive)

@@ -24,14 +24,13 @@ use crate::progress::Events;
 use crate::recipe;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Bytes of memory for one pair while it is measured: its sums, its two Gaussians in the list of Gaussians, and its
-/// result.
+/// Bytes of memory for one pair while it is measured: its sums, its two indices into the list of measured Gaussians,
+/// and its result.
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
 
 /// Returns the bytes of memory for each Gaussian in the pairs that are measured together (at most two Gaussians per
-/// pair). They hold its index and id, its record in the measurement ([`NODE_BYTES`]), its position and opacity at one
-/// frame, and those at the `frames_held` frames that a reader keeps. The memory of the source's own reader is not
-/// included.
+/// pair): its index and id, its record in the measurement ([`NODE_BYTES`]), and its position and opacity at one frame
+/// and at the `frames_held` frames that a reader keeps. The memory of the source's own reader is not included.
 pub fn bytes_per_gaussian(frames_held: usize) -> usize {
     8 + NODE_BYTES + 16 * (1 + frames_held.min(FRAME_BLOCK))
 }
@@ -82,9 +81,11 @@ impl PairMeter<'_> {
     /// `ids` and `reference` must be the same in every call.
     ///
     /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, and [`bytes_per_gaussian`] for every Gaussian in a pair.
-    /// If trajectories are gathered, also 8 bytes for each of `ids`; while they are being gathered, 12 more bytes and
-    /// the values of the frames that the reader keeps. The memory does not grow with the number of frames. If neither
-    /// positions nor opacities vary, only the first frame is measured.
+    /// If trajectories are gathered, also 8 bytes for each of `ids`. While they are being gathered, also 12 bytes for
+    /// each of `ids` and the values of the frames that the reader keeps. The memory does not grow with the number of
+    /// frames.
+    ///
+    /// If neither positions nor opacities vary, only the first frame is measured.
     ///
     /// # Errors
     /// Fails if the source cannot be read, or the scratch file cannot be read or written. The scratch file is then

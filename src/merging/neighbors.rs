@@ -8,8 +8,10 @@
 //! its own voxel or in one of the 26 around it. These voxels are looked up once for all points of a voxel, and skipped
 //! if they are farther away than the worst neighbor found so far. A voxel with very many points has a [`Tree`], so that
 //! many points in one voxel, or an ε that spans the scene, cost no more than a tree search.
-//! Memory: 16 bytes per point, and 13 bytes for each entry of the hash table, which has at most 16 entries for 7
-//! voxels. This is at most 46 bytes per point, and 40 while points are sorted.
+//!
+//! Memory: 16 bytes per point, and 13 bytes per entry of the hash table. For V voxels that contain points, the table
+//! has at most 16/7 · V entries, and V is at most the number of points. Total: at most 16 + 13 · 16/7 ≈ 46 bytes per
+//! point, and 40 while points are sorted.
 //!
 //! Source: spatial hashing after M. Teschner et al., "Optimized spatial hashing for collision detection of deformable
 //! objects", 2003.
@@ -40,19 +42,19 @@ pub struct PointIndex {
     points: Vec<TreePoint>,
     /// Trees of the voxels with more than [`MAX_WITHOUT_TREE`] points, in the order of the voxels.
     trees: Vec<Tree>,
-    table: HashTable<Occupied>,
+    table: HashTable<FilledVoxel>,
 }
 
 /// A voxel that contains at least one point.
 #[derive(Debug, Clone, Copy)]
-struct Occupied {
+struct FilledVoxel {
     start: u32,
     len: u32,
     /// Index of the voxel's tree in `trees`; an index beyond the last one if the voxel has no tree.
     tree: u32,
 }
 
-impl Occupied {
+impl FilledVoxel {
     fn points(self) -> Range<usize> {
         self.start as usize..self.start as usize + self.len as usize
     }
@@ -65,8 +67,8 @@ impl PointIndex {
     /// Edge cases: ε = 0 finds exact duplicates; an infinite ε reaches all points.
     pub fn new(mut points: Vec<TreePoint>, epsilon: f64) -> Self {
         points.retain(|point| point.at.iter().all(|x| x.is_finite()));
-        // Sides are slightly longer than ε, so that rounding never puts a point at the exact distance ε two voxels
-        // away.
+        // Sides are slightly longer than ε. Otherwise rounding could put two points at the exact distance ε into voxels
+        // that do not touch.
         let voxels = VoxelGrid::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * ROUNDING));
         let rows: Vec<u32> = (0..points.len() as u32).collect();
         let order = voxels.sort_rows(&rows, |row| points[row as usize].at);
@@ -80,7 +82,7 @@ impl PointIndex {
         let (mut start, mut tree) = (0, 0);
         for all in points.chunk_by(in_same_voxel) {
             let is_sparse = all.len() <= MAX_WITHOUT_TREE;
-            let voxel = Occupied { start, len: all.len() as u32, tree: if is_sparse { u32::MAX } else { tree } };
+            let voxel = FilledVoxel { start, len: all.len() as u32, tree: if is_sparse { u32::MAX } else { tree } };
             table.insert_unique(hash(number(&all[0])), voxel, |voxel| hash(number(&points[voxel.start as usize])));
             start += voxel.len;
             tree += u32::from(!is_sparse);
@@ -99,8 +101,8 @@ impl PointIndex {
         NeighborSearch { index: self, last_voxel: None, around: Vec::new(), nearest: NearestPoints::default() }
     }
 
-    fn find_voxel(&self, number: u64) -> Option<Occupied> {
-        let has_number = |voxel: &Occupied| self.voxels.morton_code(self.points[voxel.start as usize].at) == number;
+    fn find_voxel(&self, number: u64) -> Option<FilledVoxel> {
+        let has_number = |voxel: &FilledVoxel| self.voxels.morton_code(self.points[voxel.start as usize].at) == number;
         self.table.find(hash(number), has_number).copied()
     }
 }
@@ -121,14 +123,14 @@ pub struct NeighborSearch<'a> {
     last_voxel: Option<[u32; 3]>,
     /// Of the 27 voxels at and around the voxel queried last, those that contain points. Each comes with the step along
     /// the three axes from the queried voxel to it, encoded as in [`STEPS`].
-    around: Vec<([u8; 3], Occupied)>,
+    around: Vec<([u8; 3], FilledVoxel)>,
     nearest: NearestPoints,
 }
 
 impl NeighborSearch<'_> {
-    /// Returns the indices of the points nearest to `at`, except the point with index `query`: at most `k` points,
-    /// within the distance ε, nearest first; of two at equal distance, the one with the smaller index first. Also
-    /// returns whether more than `k` points are within ε.
+    /// Finds the points nearest to `at`, other than the point with index `query`. Returns the indices of at most `k`
+    /// points within the distance ε, sorted by distance, then by index. Also returns whether more than `k` points are
+    /// within ε.
     ///
     /// Squared distances are summed in f64 and compared with ε². Edge case: a point that is not finite has no
     /// neighbors.

@@ -1,9 +1,9 @@
 //! Computation of the proxy: the single Gaussian that replaces a cluster of merged Gaussians, its members.
 //!
 //! Input: attributes of all members at the reference frame, and their weights. Output: one Gaussian per cluster, in the
-//! stored encoding (log scales, opacity logits). Memory: 1 KiB per cluster for at most 4096 clusters at a time, beside
-//! the output. A cluster of many coincident Gaussians takes 220 bytes per member; finding their pairs may have taken
-//! more.
+//! stored encoding (log scales, opacity logits). Memory beside the output: 1 KiB per cluster, for at most 4096 clusters
+//! at a time. A cluster of many coincident Gaussians takes 220 bytes per member; the search for their pairs may have
+//! taken more.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -105,12 +105,14 @@ pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians)
 /// Computes the proxy that replaces the cluster `members`: rows of `states` and their weights, which sum to 1. The row
 /// `leader` is one of them.
 ///
-/// Mean and covariance are those of the weighted mixture. With [`ProxyPosition::Leader`] the proxy has the leader's
-/// position, and the second moments are taken about it. The base color is the weighted mean; coefficients of higher SH
-/// degrees are the weighted mean or those of the member with the largest weight (the first on a tie). The opacity
-/// follows the rule [`ProxyOpacity`]; the area in this rule is the projected area of an ellipsoid, averaged over all
-/// directions. Exact duplicates give the leader's own position, axes, scales and color. A zero quaternion counts as the
-/// identity.
+/// - Mean and covariance are those of the weighted mixture. With [`ProxyPosition::Leader`] the proxy has the leader's
+///   position instead, and the second moments are taken about it.
+/// - The base color is the weighted mean. Coefficients of higher SH degrees are the weighted mean or those of the
+///   member with the largest weight (the first on a tie).
+/// - The opacity follows the rule [`ProxyOpacity`]. The area in this rule is the projected area of an ellipsoid,
+///   averaged over all directions.
+///
+/// Exact duplicates give the leader's own position, axes, scales and color. A zero quaternion counts as the identity.
 ///
 /// Colors are computed only if `want` contains them: they are slow to read, and in most sequences they are the same at
 /// every frame.
@@ -208,9 +210,9 @@ fn nearest_sign(rotation: DQuat, reference: DQuat) -> [f64; 4] {
 }
 
 /// Returns the projected area of an ellipsoid with the half axes `scales`, averaged over all directions. It is a
-/// quarter of the surface (Cauchy), computed by Thomsen's formula, with an error of at most 1.1%. The mean of the cross
-/// sections along the three axes would be less exact: if a flat Gaussian thickens to 0.3 of its width, its area grows
-/// by 18%, but this mean by 60%.
+/// quarter of the surface (Cauchy), computed by Thomsen's formula, with an error of at most 1.1%. The mean of the three
+/// cross sections along the axes would be less exact: if a flat Gaussian thickens to 0.3 of its width, its area grows
+/// by 18%, but this mean grows by 60%.
 fn mean_area(scales: DVec3) -> f64 {
     let largest = scales.max_element();
     if largest <= 0.0 {

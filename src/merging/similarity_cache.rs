@@ -31,9 +31,9 @@ impl SimilarityCache {
         SimilarityCache(found)
     }
 
-    /// Adds the measured pairs `found`, which must not be in the cache yet. Adds nothing if the cache would then hold
-    /// more than `max_pairs` pairs.
-    pub fn add(&mut self, mut found: SimilarityCache, max_pairs: usize) {
+    /// Takes over the measured pairs `found`, none of which may be in the cache yet. If the cache already holds pairs
+    /// and would then hold more than `max_pairs`, takes over nothing.
+    pub fn merge_from(&mut self, mut found: SimilarityCache, max_pairs: usize) {
         if self.0.is_empty() {
             *self = found;
         } else if self.0.len() + found.0.len() <= max_pairs {
@@ -62,21 +62,21 @@ mod tests {
         let mut known = SimilarityCache::default();
         let requested = [(7, 2), (2, 7), (1, 2), (7, 2)];
         assert_eq!(known.missing(requested.into_iter()), [(1, 2), (2, 7)]);
-        known.add(SimilarityCache::new(vec![(2, 7, 0.5), (1, 2, f64::NAN)]), 3);
+        known.merge_from(SimilarityCache::new(vec![(2, 7, 0.5), (1, 2, f64::NAN)]), 3);
         assert_eq!(known.missing([(7, 2), (9, 1)].into_iter()), [(1, 9)]);
-        known.add(SimilarityCache::new(vec![(1, 9, -1.0)]), 3);
+        known.merge_from(SimilarityCache::new(vec![(1, 9, -1.0)]), 3);
         assert_eq!([(7, 2), (2, 7), (9, 1)].map(|pair| known.similarity(pair)), [0.5, 0.5, -1.0].map(Some));
         assert!(known.similarity((2, 1)).unwrap().is_nan() && known.similarity((4, 5)).is_none());
         assert!(known.missing(requested.into_iter()).is_empty());
-        known.add(SimilarityCache::new(vec![(4, 5, 1.0)]), 3);
+        known.merge_from(SimilarityCache::new(vec![(4, 5, 1.0)]), 3);
         assert!(known.similarity((4, 5)).is_none(), "a fourth pair is known");
     }
 
     #[test]
     fn known_pairs_stay_within_the_stated_memory() {
         let mut known = SimilarityCache::default();
-        known.add(SimilarityCache::new((0..1000).map(|i| (i, i + 1, 0.0)).collect()), 1777);
-        known.add(SimilarityCache::new((0..777).map(|i| (i, i + 2, 0.0)).collect()), 1777);
+        known.merge_from(SimilarityCache::new((0..1000).map(|i| (i, i + 1, 0.0)).collect()), 1777);
+        known.merge_from(SimilarityCache::new((0..777).map(|i| (i, i + 2, 0.0)).collect()), 1777);
         assert!(known.0.capacity() * BYTES_PER_CACHED_PAIR <= 1777 * 16, "{}", known.0.capacity());
     }
 }

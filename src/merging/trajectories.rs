@@ -8,11 +8,11 @@
 //! number of frames.
 //!
 //! Layout of the file: x, y, z and opacity logit of every Gaussian at the first frame, `[N, 4]`; then for every block
-//! of F frames (the last may be shorter) the values that vary with time, `[N, F, W]` with W = 4, 3 or 1, or nothing.
-//! All values are f32 in the byte order of this machine.
+//! of F frames (the last may be shorter) the W values that vary with time, `[N, F, W]`. W is 4 if positions and
+//! opacities vary, 3 if only positions do, and 1 if only opacities do. If nothing varies, there are no blocks. All
+//! values are f32 in the byte order of this machine.
 //!
-//! Memory while gathering: 8 bytes per Gaussian, and for each of F frames the part of its 16 bytes that varies with
-//! time; per thread, two blocks of Gaussians at F frames.
+//! Memory while gathering: 8 + 4·F·W bytes per Gaussian; per thread, two blocks of Gaussians at F frames.
 
 use std::ops::Range;
 use std::path::Path;
@@ -33,11 +33,11 @@ pub(crate) type TrajectorySample = [f32; 4];
 /// Attributes that a [`TrajectorySample`] contains.
 pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
-/// Maximum gap between two requested Gaussians, as the difference of their indices in the scratch file, up to which
-/// both are read at once, together with the Gaussians between them. Across larger gaps, they are read separately.
-const GAP: u32 = 32;
-/// Maximum number of Gaussians whose trajectories are read from the scratch file at once.
-const RUN: u32 = 2048;
+/// Maximum difference of the indices, in the scratch file, of two successive requested Gaussians that are read at once,
+/// together with the Gaussians between them. Across larger gaps, they are read separately.
+const MAX_GAP: u32 = 32;
+/// Maximum number of Gaussians that are read from the scratch file at once.
+const MAX_RUN: u32 = 2048;
 
 /// Trajectories of Gaussians in an unnamed scratch file, which is deleted when this value is dropped.
 pub(crate) struct Trajectories {
@@ -88,7 +88,8 @@ impl Trajectories {
     /// Calls `show` for every frame in order, with the samples of the Gaussians at `places` (increasing indices into
     /// the file). If no value varies with time, calls `show` only once.
     ///
-    /// Memory: for every Gaussian its sample and its varying values for the frames of a block; also a bounded buffer.
+    /// Memory: for every Gaussian in `places`, its sample and its varying values at the frames of one block; also a
+    /// bounded buffer.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
@@ -122,7 +123,7 @@ impl Trajectories {
     /// numbers (f32) of one Gaussian. The table begins `first` numbers after the start of the file.
     fn read(&self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
         let mut values: Vec<f32> = Vec::new();
-        for run in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {
+        for run in places.chunk_by(|a, b| b - a <= MAX_GAP && a / MAX_RUN == b / MAX_RUN) {
             let low = run[0] as usize;
             let rows = run[run.len() - 1] as usize + 1 - low;
             values.resize(rows * width, 0.0);

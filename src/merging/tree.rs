@@ -27,8 +27,8 @@ type NeighborCandidate = (u64, u32);
 
 /// List of the nearest points to a position found so far, up to the requested number.
 ///
-/// The list collects up to twice the requested number K of candidates, unsorted, and then drops the farther half. A
-/// heap would move about log K candidates for each candidate added.
+/// The list collects candidates, unsorted. As soon as it has twice the requested number K of them, it drops the farther
+/// half. A heap would move about log K candidates for each candidate added.
 #[derive(Debug, Default)]
 pub struct NearestPoints {
     query: u32,
@@ -49,7 +49,7 @@ impl NearestPoints {
         self.worst = ((epsilon * epsilon).to_bits(), u32::MAX);
     }
 
-    /// Adds every point in `points` that is nearer than the worst candidate found so far.
+    /// Adds every point in `points` that can still be one of the requested nearest points.
     pub fn add_points(&mut self, points: &[TreePoint]) {
         for point in points {
             let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - self.at[c])), point.index);
@@ -145,8 +145,8 @@ impl Tree {
 
 impl Node {
     /// Returns a lower bound of the pair (squared distance to `at`, index) over all points below this node. Rounding to
-    /// f64 never raises the distance of the node's box above that of a point in it, because every operation of the sum
-    /// is monotone.
+    /// f64 never makes the distance to the node's box larger than the distance to a point in it, because every
+    /// operation of the sum is monotone.
     fn nearest_possible(&self, at: [f64; 3]) -> NeighborCandidate {
         let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
         (squared(std::array::from_fn(outside)), self.smallest)

@@ -2,10 +2,10 @@
 //! computer oriented geodetic data base", 1966).
 //!
 //! Gaussians that are close in space are mostly close in this order, too. The list of all Gaussians in this order can
-//! therefore be processed in consecutive parts. A part, together with all Gaussians within one voxel side of it (its
-//! ghosts), contains every pair of Gaussians that are at most one side apart if one of the two is in the part. The
-//! order affects only the speed of reading, never a result. Memory while sorting: 20 bytes per Gaussian beside the
-//! output.
+//! therefore be processed in consecutive parts. Take a part together with its ghosts, which are all Gaussians within
+//! one voxel side of it: it contains every pair of Gaussians that are at most one side apart and of which one is in the
+//! part. The order affects only the speed of reading, never a result. Memory while sorting: 20 bytes per Gaussian
+//! beside the output.
 
 use rayon::prelude::*;
 

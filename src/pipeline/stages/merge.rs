@@ -365,7 +365,7 @@ impl<'a> Trial<'a> {
             let found = SimilarityCache::new(found);
             let likeness = |pair| known.similarity(pair).or_else(|| found.similarity(pair)).unwrap_or(f64::NAN);
             let answer = asked.pairs().map(likeness).collect();
-            known.add(found, most);
+            known.merge_from(found, most);
             Ok::<_, Error>(answer)
         })?;
         progress.advance(1);
