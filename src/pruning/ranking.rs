@@ -44,9 +44,9 @@ pub(super) struct Orders {
     /// Rank of every Gaussian by descending score S; 0 is the best. Of equal scores, the Gaussian with the smaller hash
     /// of its id comes first.
     pub(super) by_score: Vec<u32>,
-    /// Rank of every Gaussian by the criterion of stage 2, descending; 0 is the best. The criterion is the larger of
-    /// norm(S_static)/τ_S and norm(S_dynamic)/τ_D: the normalized static and dynamic scores, divided by their
-    /// thresholds. Ties are broken by score S.
+    /// Rank of every Gaussian by the criterion of stage 2, descending; 0 is the best. The criterion is
+    /// max(norm(S_static)/τ_S, norm(S_dynamic)/τ_D): the normalized static and dynamic scores, each divided by its
+    /// threshold. Ties are broken by score S.
     by_rule: Vec<u32>,
     /// Number of Gaussians that stage 1 keeps: those with the best ranks in `by_score`. `None` under
     /// [`LowScorePolicy::Rescue`], where stage 1 excludes none.
@@ -95,8 +95,8 @@ impl Orders {
     ///   [`LowScorePolicy::Rescue`]);
     /// - its rank by the criterion of stage 2, from 1, divided by the number of Gaussians that pass stage 2.
     ///
-    /// The key is at most 1 exactly for the Gaussians that the recipe keeps. Equal keys are possible, because the ranks
-    /// come from two orders; Gaussians with equal keys are sorted by score S.
+    /// The Gaussians that the recipe keeps have keys of at most 1, and all others have larger keys. The ranks come from
+    /// two orders, so keys may be equal; Gaussians with equal keys are sorted by score S.
     pub(super) fn ranking(&self, forced: &[Option<bool>]) -> Ranking {
         let key = |i: usize| {
             let stage_2_ratio = rank_over(self.by_rule[i], self.stage_2);
@@ -116,14 +116,14 @@ impl Orders {
 }
 
 /// Returns (`place` + 1) / `kept`: the rank of a Gaussian, counted from 1, divided by the number of Gaussians that a
-/// stage keeps. `place` is the rank counted from 0. If the stage keeps none, divides by one half: every quotient then
-/// exceeds 1, and the order is unchanged.
+/// stage keeps. `place` is the rank counted from 0. If the stage keeps none, divides by one half instead of 0: every
+/// quotient then exceeds 1, and the order is that of the ranks.
 fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }
 
 /// Returns the quotient `x`/`tau` of a normalized score and its threshold, by which Gaussians are ranked. It is at
-/// least 1 exactly if `x` reaches `tau`. For `tau` ≤ 0, returns a value that has the same meaning:
+/// least 1 exactly if `x` reaches `tau`. For `tau` ≤ 0 a quotient would not tell this, so the result is then:
 /// - infinity if `x` ≥ `tau`, so that all values that reach the threshold tie;
 /// - −infinity otherwise.
 fn ratio(x: f64, tau: f64) -> f64 {

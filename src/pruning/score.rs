@@ -57,10 +57,10 @@ pub struct ScoreStage {
     pub user: UserOverrides,
 }
 
-/// Ratio of the number of frames to the median life span (number of frames in which a Gaussian is alive, by its
-/// opacity) from which life spans count as short. The user is then told about linking, which joins Gaussians that
-/// continue one another in later frames.
-const SHORT_LIFE: usize = 4;
+/// Life spans count as short if the number of frames is at least this multiple of the median life span (number of
+/// frames in which a Gaussian is alive, by its opacity). The user is then told about linking, which joins Gaussians
+/// that continue one another in later frames.
+const SHORT_LIFE_RATIO: usize = 4;
 
 /// Maximum fraction of Gaussians with NaN or infinity that [`NonFinite::Few`] removes.
 const FEW_FRACTION: f64 = 0.01;
@@ -201,7 +201,7 @@ impl ScoreStage {
                 frames: info.times.len(),
                 frames_to_cover: frames_to_cover(&rows.life, info.times.len()),
                 terms: scores.terms,
-                flags: flags(&rows),
+                flags: count_flags(&rows),
                 statistics: match scene.limits.statistics_on_disk {
                     true => StatisticsRows::spill(rows, &scene.scratch)?,
                     false => StatisticsRows::Memory(rows),
@@ -246,7 +246,7 @@ fn refuse_non_finite(scene: &Scene, rows: &StatisticRows) -> Result<()> {
 }
 
 /// Returns the number of Gaussians with unusual values, such as NaN, for each kind of unusual value.
-fn flags(rows: &StatisticRows) -> FlagSummary {
+fn count_flags(rows: &StatisticRows) -> FlagSummary {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {
         non_finite: count(AnomalyFlags::NON_FINITE),
@@ -351,14 +351,16 @@ impl Scored {
         self.terms.iter().map(summarize).collect()
     }
 
-    /// Writes notes to `journal`, the record of the run. There are three kinds of notes: parts of scanning and scoring
-    /// that the scene did not need, numbers of Gaussians with unusual values, and advice if life spans are short.
-    /// - `is_partial`: whether only some frames were scanned. Terms of motion and opacity were then not measured and
-    ///   are not mentioned.
-    /// - `median_life`: median number of frames in which a Gaussian is alive.
+    /// Writes notes for the user to `journal`, the record of the run:
+    /// - parts of scanning and scoring that the scene did not need;
+    /// - numbers of Gaussians with unusual values;
+    /// - advice if life spans are short. `median_life`: median number of frames in which a Gaussian is alive.
+    ///
+    /// `is_partial`: whether only some frames were scanned. Terms of motion and opacity were then not measured and are
+    /// not mentioned.
     fn record(&self, scene: &Scene, median_life: u32, is_partial: bool, journal: &mut Journal) {
         let info = scene.source().info();
-        if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {
+        if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE_RATIO).contains(&(median_life as usize)) {
             journal.notes.push(format!(
                 "Gaussians are alive in {median_life} of {} frames (median): --link always joins Gaussians that \
                  continue one another",

@@ -78,8 +78,8 @@ impl VisibilityStage {
         self.recipe.pixel_stride.max(of_ranking)
     }
 
-    /// Returns whether the views of a frame can be chosen as soon as the frame has been read. This is so if the number
-    /// of views is not limited. Otherwise views can be chosen only after the last frame.
+    /// Returns whether the views of a frame can be chosen as soon as the frame has been read. This is possible only if
+    /// the number of views is not limited; otherwise views can be chosen only after the last frame.
     pub fn can_render_on_arrival(&self) -> bool {
         self.recipe.scoring_views == 0
     }
@@ -119,7 +119,7 @@ impl VisibilityStage {
     }
 }
 
-/// Minimum fraction of the Gaussians that the cameras must see, counting only Gaussians that are alive (opacity ≥
+/// Minimum fraction of the Gaussians that the cameras must see, among the Gaussians that are alive (opacity ≥
 /// alpha_min) in some frame. Cameras that see fewer probably belong to another scene. Cameras of trained models see two
 /// thirds; those inside a scene that fills a room see a third.
 const MIN_SEEN_FRACTION: f64 = 0.1;
