@@ -11,17 +11,18 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::VIEWS_PER_THREAD;
 use crate::progress::{Events, Message, format_duration};
 
-/// Divisor of the memory budget that gives the limit on the memory for decoded tiles of a container: 1/16 of the
-/// budget. A tile holds the values of consecutive Gaussians at consecutive frames.
-/// - If all decoded tiles together fit into the limit, they stay in memory.
-/// - If they do not, each tile is decoded again whenever it is needed. The file system caches the stored bytes anyway.
+/// Decoded tiles of a container may take at most the memory budget divided by this number. A tile holds the values of
+/// consecutive Gaussians at consecutive frames.
+/// - If all decoded tiles together take no more than that, they stay in memory.
+/// - If they take more, each tile is decoded again whenever it is needed. The file system caches the stored bytes
+///   anyway.
 ///
 /// More memory for tiles would thus save only decoding time, and leave less memory to other processes.
 const HELD_TILES_DIVISOR: u64 = 16;
 
-/// Functions to reduce the memory of a run. Each halves one of the limits on what stages keep in memory at a time,
-/// which slows the run. The functions that slow it most come first. If several functions free equally much memory, the
-/// last of them is chosen.
+/// Functions that reduce the memory of a run. Each halves one limit on what stages keep in memory at a time, which
+/// slows the run. They are sorted from the one that slows the run most to the one that slows it least. If several free
+/// equally much memory, the last of these is chosen.
 const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { views_together: limits.views_together.div_ceil(2), ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
@@ -42,8 +43,9 @@ pub struct MemoryPlan {
 
 impl MemoryPlan {
     /// Finds the fastest limits under which all stages of a run on the input `work` fit into the memory budget
-    /// `budget`, and returns the plan with them. `estimates` returns the estimates of all stages for given limits. If
-    /// the user asked for the plan ([`Verbosity::Plan`]), sends it as text to `events`, even if the stages do not fit.
+    /// `budget`, and returns the plan with these limits. `estimates` returns the estimates of all stages for given
+    /// limits. Sends the plan as text to `events` if the user asked for it ([`Verbosity::Plan`]), even if the stages do
+    /// not fit.
     ///
     /// # Errors
     /// Fails if the stages do not fit under any limits; the error states the smallest sufficient budget.
@@ -72,9 +74,8 @@ impl MemoryPlan {
         Self::closest(work, budget.limit(), estimates).excess_bytes() == 0
     }
 
-    /// Returns the fastest plan for a run on the input `work` in which every stage fits into `budget` bytes. If there is
-    /// none, returns the plan that takes the least memory. `estimates` returns the estimates of all stages for given
-    /// limits.
+    /// Returns the fastest plan for a run on the input `work` in which every stage fits into `budget` bytes; if there
+    /// is none, the plan that takes the least memory. `estimates` returns the estimates of all stages for given limits.
     pub(crate) fn closest(
         work: Workload,
         budget: u64,
@@ -122,9 +123,9 @@ impl MemoryPlan {
     }
 
     /// Returns this plan, with [`Limits::keeps_tiles`] set if all decoded tiles of the container may stay in memory, so
-    /// that no tile is read twice. A tile holds the values of consecutive Gaussians at consecutive frames. Two
-    /// conditions must hold:
-    /// - The memory budget suffices for all stages and the decoded tiles together.
+    /// that no tile is read twice. A tile holds the values of consecutive Gaussians at consecutive frames. Tiles may
+    /// stay under two conditions:
+    /// - All stages and the decoded tiles together fit into the memory budget.
     /// - The decoded tiles take at most the budget divided by [`HELD_TILES_DIVISOR`].
     fn with_held_tiles(mut self) -> MemoryPlan {
         let decoded = self.work.input.decoded;
@@ -142,23 +143,23 @@ impl MemoryPlan {
 
     /// Returns the peak memory of the run in bytes, which is the memory during the stage that takes most.
     pub fn peak_bytes(&self) -> u64 {
-        self.base() + self.estimates.iter().map(|estimate| estimate.bytes(&self.work)).max().unwrap_or(0)
+        self.base_bytes() + self.estimates.iter().map(|estimate| estimate.bytes(&self.work)).max().unwrap_or(0)
     }
 
     /// Returns the bytes of memory that are taken throughout the run, whichever stage runs: program, threads, index,
     /// time stamps, cameras, and decoded tiles that stay in memory.
-    fn base(&self) -> u64 {
+    fn base_bytes(&self) -> u64 {
         let held = if self.limits.keeps_tiles { self.work.input.decoded } else { 0 };
         PROGRAM_BYTES + PER_THREAD * self.work.threads + self.work.known_bytes() + held
     }
 
     /// Returns the number of bytes by which memory exceeds the budget: the excess of each stage, summed over all
-    /// stages, plus the excess of the memory that every stage needs ([`MemoryPlan::base`]). Returns 0 if all stages
-    /// fit.
+    /// stages, plus the excess of [`MemoryPlan::base_bytes`], the memory that is taken throughout the run. Returns 0 if
+    /// all stages fit.
     fn excess_bytes(&self) -> u64 {
-        let available = self.budget.saturating_sub(self.base());
+        let available = self.budget.saturating_sub(self.base_bytes());
         let beyond = self.estimates.iter().map(|estimate| estimate.bytes(&self.work).saturating_sub(available));
-        beyond.sum::<u64>() + self.base().saturating_sub(self.budget)
+        beyond.sum::<u64>() + self.base_bytes().saturating_sub(self.budget)
     }
 
     /// Returns the error for a memory budget that is too small. It states the smallest sufficient budget.
@@ -201,7 +202,7 @@ impl MemoryPlan {
             "  = {} program and threads + {} frames, cameras, index + {} tiles held + the largest stage:",
             format_bytes(PROGRAM_BYTES + PER_THREAD * work.threads),
             format_bytes(work.known_bytes()),
-            format_bytes(self.base() - PROGRAM_BYTES - PER_THREAD * work.threads - work.known_bytes())
+            format_bytes(self.base_bytes() - PROGRAM_BYTES - PER_THREAD * work.threads - work.known_bytes())
         );
         for estimate in &self.estimates {
             let parts = |parts: &[MemoryPart], unit: fn(u64) -> String| -> String {

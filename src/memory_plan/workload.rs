@@ -15,8 +15,8 @@ use crate::render;
 /// checksum has been verified.
 const PER_TILE: u64 = 1;
 /// Bytes of memory for each pair of a column (attribute) and a block of Gaussians, in a container that is open or being
-/// written. They hold the index entry of the last constant tile of this pair: a stored block whose values are the same
-/// at all its frames.
+/// written. A constant tile is a stored block whose values are the same at all its frames. The bytes hold the index
+/// entry of the last constant tile of the pair.
 const PER_SLOT: u64 = 80;
 /// Bytes of memory per frame of a container that is being written: its time stamp (8 bytes), counted twice because the
 /// list of time stamps grows by being copied to twice its length.
@@ -148,7 +148,7 @@ impl Workload {
     /// for later reads. Attributes that do not vary in time are not counted.
     ///
     /// Let n be the smaller of [`Limits::max_kept_frames`] and the number of frames per tile (stored block) of the
-    /// input. If n is at least 2, the reader keeps n + 2 frames. If n is 0 or 1, it keeps none.
+    /// input. The reader keeps n + 2 frames if n is at least 2, and no frames otherwise.
     pub fn kept_frames_bytes(&self, limits: &Limits, columns: Attributes) -> u64 {
         let frames = match (limits.max_kept_frames as u64).min(self.input.frame_block) {
             0..=1 => 0,
@@ -177,11 +177,13 @@ impl Workload {
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
     }
 
-    /// Returns the memory of a pass over views as two lists of parts: parts that grow with the number of Gaussians, in
-    /// bytes per Gaussian, and parts of fixed size, in bytes. The parts are: frames that are ready to be rendered, with
-    /// their attributes `columns`; frames being read; and views being rendered, with the results of the pass. `sums`:
-    /// size of the results, in bytes per Gaussian. The results are stored once for the whole pass, and once more for
-    /// each view being rendered.
+    /// Returns the memory of a pass over views as two lists of parts: first, parts that grow with the number of
+    /// Gaussians, in bytes per Gaussian; second, parts of fixed size, in bytes. The parts are:
+    /// - frames that are ready to be rendered, with their attributes `columns`;
+    /// - frames being read;
+    /// - views being rendered;
+    /// - results of the pass, of `sums` bytes per Gaussian. They are stored once for the whole pass, and once more for
+    ///   each view being rendered.
     pub fn view_pass_memory(
         &self,
         limits: &Limits,
@@ -226,10 +228,9 @@ impl Workload {
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
-    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames. The
-    /// number is below 1 if only a part of the input is read. A tile (stored block of Gaussians × frames) is always
-    /// read as a whole. It is read several times if [`Limits::max_kept_frames`] lets readers keep only some of its
-    /// frames.
+    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames. It is
+    /// below 1 if only a part of the input is read. A tile (stored block of Gaussians × frames) is always read as a
+    /// whole. It is read several times if readers may keep only some of its frames ([`Limits::max_kept_frames`]).
     pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
@@ -241,9 +242,9 @@ impl Workload {
         (frames.min(blocks) * again) as f64 / blocks as f64
     }
 
-    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames, like
-    /// [`Workload::full_reads`], but for a stage that reads blocks of Gaussians with arbitrary ids. A tile (stored
-    /// block) may contain Gaussians of two such blocks; it is then read for each of them.
+    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames, for a
+    /// stage that reads blocks of Gaussians with arbitrary ids. It is twice [`Workload::full_reads`] for an input with
+    /// tiles (stored blocks): a tile may contain Gaussians of two such blocks, and is then read for each of them.
     pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
         shared * self.full_reads(frames, limits)
@@ -331,8 +332,8 @@ pub struct RenderCost {
     gaussian: f64,
     /// Time for rendering one view, per pixel of the image, in seconds on one processor core.
     pixel: f64,
-    /// Function that returns the factor by which the times `gaussian` and `pixel` are multiplied: the measured time of
-    /// this kind of rendering divided by the assumed time, for example [`Throughput::render_time`].
+    /// Function that returns a factor, by which both times are multiplied: the measured time of this kind of rendering
+    /// divided by the assumed time, for example [`Throughput::render_time`].
     pace: fn(&Throughput) -> f64,
 }
 
@@ -348,8 +349,8 @@ pub const REMOVAL_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-
 pub const RENDER_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render_time };
 
 /// Returns the bytes of memory that zstd takes for its tables for finding matches, at the compression level `level`,
-/// for `bytes` bytes of input. There are two tables of 4-byte entries. Each has at most twice as many entries as the
-/// input has bytes, rounded up to a power of two. Together they do not exceed a maximum, which depends on the level.
+/// for an input of `bytes` bytes. There are two tables of 4-byte entries. Each has at most 2n entries, where n is
+/// `bytes` rounded up to a power of two. Together they do not exceed a maximum, which depends on the level.
 fn zstd_tables(level: i32, bytes: u64) -> u64 {
     let most_mebibytes = match level {
         ..=3 => 1,
