@@ -44,8 +44,8 @@ impl<'a> SourceWithDeltas<'a> {
         ChangedReader { reader, delta, trajectory, frames: self.info.times.len(), all_sh: self.dropped_sh_buffer() }
     }
 
-    /// Returns an empty buffer into which all SH coefficients of `source` can be read before those of higher degrees
-    /// are dropped; `None` if none are dropped.
+    /// Returns an empty buffer for all SH coefficients of `source`, which are read before those of higher degrees are
+    /// dropped. Returns `None` if none are dropped.
     fn dropped_sh_buffer(&self) -> Option<AttributeValues> {
         let degree = self.source.info().sh_degree;
         (degree > self.info.sh_degree).then(|| Gaussians::zeros(0, degree).sh)
@@ -129,7 +129,7 @@ mod tests {
     use crate::model::NO_SH_LIMIT;
 
     #[test]
-    fn each_gaussian_gets_its_own_delta_in_every_column() {
+    fn each_gaussian_gets_its_own_delta_in_every_attribute() {
         let plain = DemoScene::new(40, 3);
         let mut by = Gaussians::zeros(40, 0);
         by.log_scale = Default::default();
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_of_a_trajectory_delta_vary_in_time() {
+    fn attributes_of_a_trajectory_delta_vary_in_time() {
         let plain = DemoScene::new(30, 5);
         let keyframe = |scale: f32| {
             let mut by = Gaussians::zeros(0, 0);

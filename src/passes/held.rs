@@ -1,5 +1,5 @@
-//! Consecutive frames that are kept in memory together. Input that arrives frame by frame can thus be processed by
-//! passes that read one block of Gaussians after the other.
+//! Consecutive frames that are kept in memory together. Passes that read one block of Gaussians after the other can
+//! thus process an input that arrives frame by frame.
 
 use std::ops::Range;
 

@@ -1,5 +1,5 @@
-//! Division of the Gaussians' attributes at a frame into slices, one for each block of Gaussians, so that threads can
-//! write blocks in parallel.
+//! Division of the attributes of all Gaussians at one frame into slices, one set for each block of Gaussians, so that
+//! several threads can write blocks at the same time.
 
 use super::GAUSSIANS_PER_BLOCK;
 use crate::model::{Attributes, Gaussians};

@@ -5,8 +5,8 @@ use std::num::NonZeroU32;
 use crate::model::{FrameView, ViewSchedule};
 use crate::recipe;
 
-/// Number of views per frame that makes reading the frame worth its time. A selection of few views takes this many
-/// views of each frame that it uses, and so reads fewer frames.
+/// Number of views that a selection of few views takes from each frame that it uses; more only if there are too few
+/// frames. Reading a frame takes long, so it is better to render several of its views and to read fewer frames.
 pub const VIEWS_PER_FRAME: usize = 3;
 
 /// Maximum stride at which the pixels of a view are rendered (every stride-th pixel in each direction). Beyond this
