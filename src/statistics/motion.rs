@@ -137,9 +137,9 @@ impl MotionSums {
         }
     }
 
-    /// Has the same result as [`MotionSums::add_frame_of_runs`], for a frame whose opacities equal the opacities of all
-    /// earlier frames. The same Gaussians are then alive in all frames, so the history of each Gaussian is not needed,
-    /// and half as much memory is accessed (`cargo bench --bench scan`).
+    /// Adds the next frame with the result of [`MotionSums::add_frame_of_runs`], for a frame whose opacities equal
+    /// those of all earlier frames. The same Gaussians are then alive in all frames, so the history of each Gaussian is
+    /// not needed, and half as much memory is accessed (`cargo bench --bench scan`).
     #[inline(always)]
     fn add_steady_frame<const EVEN: bool>(&mut self, position: &AttributeValues, steps: [f64; 2]) {
         self.steady += 1;
@@ -154,9 +154,9 @@ impl MotionSums {
         }
     }
 
-    /// Counts the frames in `steady`, in which no opacity has changed: adds them to the numbers of steps and turns of
-    /// each Gaussian that is alive (opacity ≥ alpha_min) in them. The other Gaussians have not been alive in any frame
-    /// yet, so their sums of steps and turns are set to 0. Must be called before results are read.
+    /// Counts the frames in `steady`, in which no opacity has changed. Each Gaussian that is alive (opacity ≥
+    /// alpha_min) in them gets their number of steps and turns. The others have not been alive in any frame yet, so
+    /// their sums over steps and turns are set to 0. Must be called before results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
@@ -243,8 +243,8 @@ impl MotionSums {
     }
 }
 
-/// Returns the planes of x, y and z values of `column`, each as a slice of `n` values. Equal lengths that the compiler
-/// can see remove the bounds checks.
+/// Returns the planes of x, y and z values of `column`, each as a slice of `n` values. The compiler sees that their
+/// lengths are equal, and so removes the bounds checks.
 #[inline(always)]
 fn planes(column: &AttributeValues, n: usize) -> [&[f32]; 3] {
     std::array::from_fn(|axis| &column.plane(axis)[..n])

@@ -2,8 +2,8 @@
 //!
 //! The trajectory magnitude D states how far a Gaussian moves per frame, the curvature κ how much its motion turns or
 //! accelerates. Rounding moves even a resting Gaussian: D ≈ 0.71 ulp and κ ≈ 1.2 ulp, where one ulp is the distance
-//! between neighboring f32 values. All coordinates of a scene share one offset, so the ulp of the largest coordinate is
-//! used for every Gaussian.
+//! between neighboring f32 values. All coordinates of a scene may contain one large common offset, so the ulp of the
+//! largest coordinate is used for every Gaussian.
 
 use crate::model::{AnomalyFlags, StatisticRows};
 

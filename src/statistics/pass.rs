@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn constant_columns_are_read_once_without_changing_a_bit() {
+    fn constant_attributes_are_read_once_without_changing_a_bit() {
         let scene = DemoScene::new(1500, 5);
         let info = scene.info().clone();
         let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();

@@ -12,7 +12,7 @@ const EVEN_TOLERANCE: f64 = 1e-2;
 
 /// Shortest accepted time step, as a fraction of the mean step. The curvature κ is a difference of positions divided by
 /// two steps; its square must not overflow.
-const LEAST_STEP: f64 = 1e-50;
+const MIN_STEP: f64 = 1e-50;
 
 /// Number of bits, in fixed point, of the largest contribution (covered pixels times opacity) that a Gaussian can have
 /// in one view. [`super::projection`] rounds by adding 2⁵², so a contribution must stay below 2⁵²; one bit is kept in
@@ -69,7 +69,7 @@ impl ScanPlan {
         let pairs = u32::try_from(schedule.pair_count())
             .map_err(|_| Error::usage(format!("{} (frame, view) pairs: 2^32 is the limit", schedule.pair_count())))?;
         let steps = if scan.motion == MotionParams::Runs { uneven_steps(times) } else { Vec::new() };
-        if let Some(t) = steps.iter().position(|step| step.is_nan() || *step < LEAST_STEP) {
+        if let Some(t) = steps.iter().position(|step| step.is_nan() || *step < MIN_STEP) {
             return Err(Error::usage(format!(
                 "two time stamps are too close together: frame {} has {:e}, frame {t} has {:e}, and the sequence spans \
                  {:e}",
@@ -87,13 +87,13 @@ impl ScanPlan {
         })
     }
 
-    /// Creates the plan (parameters) with which the scan of a stream begins. The scan is the pass over all frames that
-    /// computes the statistics of the Gaussians. It begins before the frames have arrived, so their number and time
-    /// stamps are unknown; the plan assumes evenly spaced frames. `cameras` lists all cameras that may see the frames.
+    /// Creates the plan (parameters) with which the scan of a stream begins. The frames have not arrived then, so their
+    /// number and time stamps are unknown; the plan assumes evenly spaced frames. `cameras` lists all cameras that may
+    /// see the frames.
     ///
     /// After the last frame, [`ScanPlan::new`] creates a second plan, for the complete sequence, with which the scan is
-    /// finished. This is possible if the frames are in fact evenly spaced; [`ScanPlan::fits_scan_begun_with`] returns
-    /// whether it is.
+    /// finished. This is possible only if the frames are in fact evenly spaced; [`ScanPlan::fits_scan_begun_with`]
+    /// returns whether it is.
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {

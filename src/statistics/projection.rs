@@ -25,9 +25,9 @@ const JACOBIAN_CLAMP: f64 = 1.3;
 const DILATION_PX2: f64 = 0.3;
 /// Half the side of a projected Gaussian's bounding box, in standard deviations.
 const REACH: f64 = 3.0;
-/// Number of Gaussians for which one step of the projection is computed before the next step begins. In a single loop
-/// over all steps, each iteration would be a dependency chain of about 150 cycles, too long for a processor to overlap
-/// two iterations.
+/// Number of Gaussians for which one step of the projection is computed before the next step begins. A single loop that
+/// computes all steps for one Gaussian after the other would have a dependency chain of about 150 cycles per iteration,
+/// too long for a processor to overlap two iterations.
 const BLOCK_LANES: usize = 32;
 /// Constant 2⁵². Adding it to x in [0, 2⁵²) leaves x, rounded to an integer, in the low bits of the sum.
 const ROUNDER: f64 = 4_503_599_627_370_496.0;
@@ -85,7 +85,8 @@ pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageSca
     project_planes(&view, planes, scale, sums);
 }
 
-/// Does the same as [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
+/// Does the same as [`project_planes`], with the same operations, but compiled for AVX2, which processes four Gaussians
+/// at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
@@ -190,8 +191,9 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// Computes the standard deviations along x and y and the root of the determinant of the 2-D covariance of each
-    /// projected Gaussian. `axes` is the matrix R·S (rotation times scales) of each Gaussian, entry by entry.
+    /// Computes three values of the 2-D covariance of each projected Gaussian: the standard deviations along x and y,
+    /// and the square root of the determinant. `axes` is the matrix R·S (rotation times scales) of each Gaussian, entry
+    /// by entry.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "i runs over many planes at once")]
     fn project_covariances(&mut self, view: &ScanView, axes: [&[f64; N]; 9]) {

@@ -43,8 +43,8 @@ pub struct BlockScan<'a> {
     state: BlockState,
     life: LifeSpans,
     motion: MotionSums,
-    /// Low part of the sum of covered pixels times opacity, in fixed point, for each Gaussian; the whole sum is
-    /// `carried · 2^CARRY_BITS + coverage`.
+    /// Low part of the sum of covered pixels times opacity, in fixed point, for each Gaussian. The whole sum is
+    /// `carried` · 2^[`CARRY_BITS`] + `coverage`.
     coverage: Vec<u64>,
     carried: Vec<u32>,
     /// Number of (frame, view) pairs added to `coverage` since its high bits were last moved to `carried`.
@@ -135,8 +135,8 @@ impl<'a> BlockScan<'a> {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// Adds a frame like [`BlockScan::advance_portable`], compiled for AVX2: the same operations, several Gaussians at
-    /// a time.
+    /// Adds a frame with the same operations as [`BlockScan::advance_portable`], but compiled for AVX2, which processes
+    /// several Gaussians at a time.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn advance_avx2(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {

@@ -92,8 +92,8 @@ fn scan(frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> Blo
     scan_at(&even_times(frames.len()), frames, schedule, scan)
 }
 
-/// Scans one Gaussian over `frames` frames and returns its statistics. At frame t it has the x coordinate `x(t)` and
-/// the opacity `opacity(t)`. No camera sees it. `motion`: definition of the statistics of motion.
+/// Scans one Gaussian over `frames` frames and returns its statistics. At frame t its x coordinate is `x(t)` and its
+/// opacity is `opacity(t)`. No camera sees it. `motion`: definition of the statistics of motion.
 fn scan_one(
     frames: usize,
     x: impl Fn(usize) -> f32,
@@ -397,7 +397,7 @@ fn mean_coverage_of_300_000_equal_views_is_that_of_one() {
 }
 
 #[test]
-fn unchanged_columns_may_be_left_out_of_changed() {
+fn unchanged_attributes_may_be_omitted_from_changed() {
     let (mut frames, schedule) = (wanderers(300, 5, 8), schedule(5, 2));
     let first = frames[0].clone();
     for frame in &mut frames {

@@ -22,9 +22,9 @@ use crate::error::{Error, Result};
 use crate::model::StatisticRows;
 use crate::source::{BlockReader, Ids, Prefetch};
 
-/// Maximum number of units of work (a block of Gaussians at some frames) that wait to be decoded after their bytes have
-/// been fetched. Each lane (a decoding thread and an accumulating thread) has a queue of this length.
-const FETCHED: usize = 4;
+/// Maximum number of units of work (a block of Gaussians at some frames) in the queue of each lane (a decoding thread
+/// and an accumulating thread). The bytes of a unit in the queue have been fetched, and it waits to be decoded.
+const MAX_QUEUED_UNITS: usize = 4;
 
 /// Unit of work: a block of Gaussians at the frames of one frame block (consecutive frames that the source stores
 /// together).
@@ -55,7 +55,7 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
     thread::scope(|scope| {
         let mut to_lanes = Vec::with_capacity(lanes);
         for _ in 0..lanes {
-            let (to_lane, fetched) = bounded(FETCHED);
+            let (to_lane, fetched) = bounded(MAX_QUEUED_UNITS);
             // A channel without capacity: the decoding thread waits until the other thread takes the reader, so a lane
             // has at most two readers.
             let (decoded, ready) = bounded(0);

@@ -43,7 +43,7 @@ impl Scores {
 /// Term of a score: a quantity and its normalization.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
-    /// Quantity of a Gaussian, such as its contribution, that this term of a score normalizes.
+    /// Quantity that this term normalizes, such as the contribution of a Gaussian.
     #[serde(rename = "of")]
     pub quantity: ScoredQuantity,
     /// Normalization of the quantity, from its percentiles over all Gaussians.
@@ -110,7 +110,7 @@ pub fn score(rows: &StatisticRows, frames: usize, recipe: &recipe::ScoreParams) 
 }
 
 /// Computes the scores of the Gaussians with the statistics `rows` in a sequence of `frames` frames, like [`score`].
-/// `passes` selects how percentiles are found: exactly in two passes over the values, or approximately in one.
+/// `passes` selects how percentiles are found: exactly, in two passes over the values, or approximately, in one.
 pub fn score_with_passes(
     passes: PercentilePasses,
     rows: &StatisticRows,
@@ -126,30 +126,30 @@ pub fn score_with_passes(
     let mut sum = Summation { is_finite: &is_finite, recipe, passes, terms: Vec::new() };
     let mut static_score = vec![0.0; rows.len()];
     match recipe.static_term {
-        StaticScoreTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, By(W), 1.0, |i| rows.w[i]),
+        StaticScoreTerm::Peak if !rows.w.is_empty() => sum.add_term(&mut static_score, By(W), 1.0, |i| rows.w[i]),
         StaticScoreTerm::Geometric if !rows.w.is_empty() => {
-            sum.add(&mut static_score, ScoredQuantity::Geometric, 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
+            sum.add_term(&mut static_score, ScoredQuantity::Geometric, 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
         }
-        _ => sum.add(&mut static_score, By(C), 1.0, |i| rows.c[i]),
+        _ => sum.add_term(&mut static_score, By(C), 1.0, |i| rows.c[i]),
     }
-    sum.add(&mut static_score, By(E), recipe.lambda, |i| rows.e[i]);
+    sum.add_term(&mut static_score, By(E), recipe.lambda, |i| rows.e[i]);
     let mut dynamic_score = vec![0.0; rows.len()];
-    sum.add(&mut dynamic_score, By(D), 1.0, |i| rows.d[i] * motion_weight(i));
-    sum.add(&mut dynamic_score, By(Kappa), recipe.mu, |i| rows.kappa[i] * motion_weight(i));
-    sum.add(&mut dynamic_score, By(V), recipe.eta, |i| rows.v[i]);
-    sum.add(&mut dynamic_score, By(Life), recipe.xi, life);
+    sum.add_term(&mut dynamic_score, By(D), 1.0, |i| rows.d[i] * motion_weight(i));
+    sum.add_term(&mut dynamic_score, By(Kappa), recipe.mu, |i| rows.kappa[i] * motion_weight(i));
+    sum.add_term(&mut dynamic_score, By(V), recipe.eta, |i| rows.v[i]);
+    sum.add_term(&mut dynamic_score, By(Life), recipe.xi, life);
 
     let score =
         static_score.iter().zip(&dynamic_score).map(|(s, d)| recipe.w_static * s + recipe.w_dynamic * d).collect();
     let mut static_norm = vec![0.0; rows.len()];
-    sum.add(&mut static_norm, ScoredQuantity::Static, 1.0, |i| static_score[i]);
+    sum.add_term(&mut static_norm, ScoredQuantity::Static, 1.0, |i| static_score[i]);
     let mut dynamic_norm = vec![0.0; rows.len()];
-    sum.add(&mut dynamic_norm, ScoredQuantity::Dynamic, 1.0, |i| dynamic_score[i]);
+    sum.add_term(&mut dynamic_norm, ScoredQuantity::Dynamic, 1.0, |i| dynamic_score[i]);
     let terms = sum.terms;
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
 
-/// Working state while the scores are computed, as weighted sums of normalized quantities.
+/// Data that all terms share while the scores, which are weighted sums of normalized quantities, are computed.
 struct Summation<'a> {
     is_finite: &'a [bool],
     recipe: &'a recipe::ScoreParams,
@@ -160,7 +160,7 @@ struct Summation<'a> {
 impl Summation<'_> {
     /// Adds `weight` · norm(`value(i)`) to `total[i]` for every Gaussian i whose statistics are finite. Appends
     /// `quantity` and its normalization to the list of terms. Does nothing if the weight is 0.
-    fn add(&mut self, total: &mut [f64], quantity: ScoredQuantity, weight: f64, value: impl Fn(usize) -> f64) {
+    fn add_term(&mut self, total: &mut [f64], quantity: ScoredQuantity, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;
         }
