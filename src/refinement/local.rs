@@ -1,6 +1,6 @@
-//! Scratch file of the frame states (attributes of all Gaussians at one frame) of the target views, and of their
-//! derivatives with respect to the stored parameters. A frame in which most Gaussians are invisible is stored sparsely:
-//! only its visible Gaussians are written.
+//! Scratch file with the frame states (attributes of all Gaussians at one frame) at the frames of the target views, and
+//! with the derivatives of these states with respect to the stored parameters. A frame in which most Gaussians are
+//! invisible is stored sparsely: only its visible Gaussians are written.
 
 use std::path::Path;
 
@@ -31,8 +31,8 @@ impl LinearizedState {
         LinearizedState { present: None, state: Gaussians::zeros(0, sh_degree), jacobian: Jacobian::default() }
     }
 
-    /// Returns the state of only the Gaussians with the indices `places` in the model; `places` must be increasing. The
-    /// Gaussian with the index `places[i]` in this state has the index i in the result.
+    /// Returns the state of only the Gaussians with the indices `places` in the model, which must be increasing. The
+    /// result belongs to the smaller model of only these Gaussians, in which the Gaussian `places[i]` has the index i.
     pub(super) fn pick(&self, places: &[u32]) -> LinearizedState {
         let Some(present) = &self.present else { return self.rows(places, None) };
         let stays = |(to, place): (u32, &u32)| Some((present.binary_search(place).ok()? as u32, to));
@@ -50,9 +50,9 @@ impl LinearizedState {
         is_sparse.then(|| self.rows(&present, Some(present.clone())))
     }
 
-    /// Returns a copy with only the Gaussians that have the indices `rows` in this state. `present` becomes
-    /// [`LinearizedState::present`] of the copy: the index in the model of each Gaussian if invisible ones are left
-    /// out, otherwise `None`.
+    /// Returns a copy with only the Gaussians that have the indices `rows` in this state. The argument `present` is
+    /// stored as [`LinearizedState::present`] of the copy: the index of each Gaussian in the model if invisible ones
+    /// are left out, otherwise `None`.
     fn rows(&self, rows: &[u32], present: Option<Vec<u32>>) -> LinearizedState {
         LinearizedState { present, state: self.state.pick(rows), jacobian: self.jacobian.pick(rows) }
     }
@@ -70,15 +70,15 @@ pub(super) struct LinearizedFrames {
     file: Spill,
     varying: Attributes,
     /// State of all Gaussians at the first frame. Attributes that do not vary with time have these values in all
-    /// frames. Of attributes that vary, only the array size (number of components × number of Gaussians) holds for the
-    /// other frames.
+    /// frames. Of attributes that vary, the other frames have other values, but arrays of the same size (number of
+    /// components × number of Gaussians).
     first: Option<LinearizedState>,
     frames: Vec<StoredFrame>,
 }
 
 /// Position of a frame in the scratch file. `at`: byte offset. `present`: number of stored Gaussians if invisible ones
-/// are left out, otherwise `None`. If Gaussians are left out, the indices of the stored ones are written at `at`, then
-/// their values.
+/// are left out, otherwise `None`. If Gaussians are left out, the bytes at `at` begin with the indices of the stored
+/// Gaussians; their values follow.
 #[derive(Debug, Clone, Copy)]
 struct StoredFrame {
     at: u64,

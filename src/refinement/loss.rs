@@ -9,11 +9,11 @@ use crate::metrics::{BYTES_PER_PIXEL, SSIM_SLOPE_BYTES_PER_PIXEL, decibels, ssim
 use crate::passes::pixel_stride;
 use crate::render::Image;
 
-/// Factor of the mean square error in the loss. With it, the squared error and 1 − SSIM contribute about equally at 35
-/// dB if both have the weight 0.5.
+/// Factor of the mean square error in the loss. It is chosen so that the squared error and 1 − SSIM contribute about
+/// equally to the loss of renders with 35 dB, if both have the weight 0.5.
 const SQUARED_WEIGHT: f64 = 20.0;
-/// Wanted number of rendered pixels of a training view per survivor (Gaussian left by pruning), from which the stride
-/// follows. In measurements with at least 2 pixels per survivor, refinement lost at most 0.1 dB.
+/// Wanted number of rendered pixels of a training view per survivor (Gaussian left by pruning). It determines the
+/// stride of the rendered pixels. In measurements with at least 2 pixels per survivor, refinement lost at most 0.1 dB.
 const PIXELS_PER_GAUSSIAN: f64 = 2.5;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.

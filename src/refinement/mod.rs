@@ -57,7 +57,7 @@ pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
 /// beginning; prune steps between optimization steps then remove more of them.
 const MIN_START_FRACTION: f64 = 0.4;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
-pub(crate) const MIN_PRUNE_FRACTION: f64 = 0.8;
+pub(crate) const MIN_KEPT_FRACTION: f64 = 0.8;
 /// Number of views by which the Gaussians are ranked for one prune step. Each prune step takes the next views of the
 /// random order of the training views.
 const RANKING_VIEWS: usize = 48;
@@ -79,19 +79,20 @@ pub struct RefineStage {
     loss: Loss,
     /// Number of optimization steps after the last prune step; each uses one view.
     pub steps: usize,
-    /// Number of optimization steps before each prune step, reduced by [`RefineStage::steps_before`] while many
-    /// Gaussians are left.
+    /// Upper limit of the number of optimization steps before a prune step. [`RefineStage::steps_before`] returns a
+    /// smaller number while many Gaussians are left.
     pub steps_per_prune: usize,
     /// Maximum number of target views (renders of the original that the Gaussians are fitted to).
     pub pictures: usize,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub prunes: bool,
-    /// Color difference (norm over red, green, blue, each from 0 to 1) whose square is added to the squared color
-    /// difference between a Gaussian and the colors that it hides, when Gaussians are ranked for a prune step; see
-    /// [`crate::render::RemovalError`].
+    /// Constant c of the removal errors by which Gaussians are ranked for a prune step: c² is added to each squared
+    /// difference between the color of a Gaussian and the colors that it hides (norm over red, green, blue, each from 0
+    /// to 1). See [`crate::render::RemovalError`].
     pub contrast_floor: f64,
-    /// Maximum number of keyframes of the time-varying delta (values that refinement adds to each frame, interpolated
-    /// between keyframes), for inputs with explicit frames. With 0, all added values are constant in time.
+    /// Maximum number of keyframes of the time-varying delta, for inputs with explicit frames. This delta holds values
+    /// that refinement adds to each frame, interpolated between keyframes. With 0 keyframes, all added values are
+    /// constant in time.
     pub keyframes: usize,
     /// Fraction of the Gaussians that the user wants to keep; `None` if not given.
     pub target: Option<f64>,
@@ -161,10 +162,10 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. The
-    /// stride follows from `pixels`, the number of pixels of a view, and from a number of Gaussians
-    /// ([`RefineStage::stride`]). This number is `first`, with which refinement begins; or a third of it if prune steps
-    /// remove Gaussians, because fewer Gaussians allow a larger stride.
+    /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. It is
+    /// [`RefineStage::stride`] for `first` Gaussians, the number with which refinement begins. If prune steps remove
+    /// Gaussians, it is the stride for a third of `first`, because fewer Gaussians allow a larger stride. `pixels`:
+    /// number of pixels of a view.
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
         let fewer = if self.prunes { first / 3 } else { first };
         self.stride(pixels, fewer)
@@ -177,7 +178,8 @@ impl RefineStage {
     }
 
     /// Returns the number of final optimization steps (after the last prune step) for a model that keeps the fraction
-    /// `kept` of all Gaussians. The number grows in proportion to the fraction removed, up to [`RefineStage::steps`].
+    /// `kept` of all Gaussians: [`RefineStage::steps`] · (1 − `kept`) / (1 − [`MIN_START_FRACTION`]), at most
+    /// [`RefineStage::steps`], rounded up.
     fn last_steps(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - MIN_START_FRACTION)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
@@ -194,23 +196,23 @@ impl RefineStage {
         }
     }
 
-    /// Returns the number of optimization steps before a prune step, `steps_per_prune · √(wanted / left)`, for `left`
-    /// Gaussians now and `wanted` Gaussians after the last prune step. With more Gaussians there are fewer steps, because
-    /// a step takes longer and more of its effect is removed later.
+    /// Returns the number of optimization steps before a prune step: `steps_per_prune` · √(`wanted` / `left`), rounded
+    /// up, for `left` Gaussians now and `wanted` Gaussians after the last prune step. With more Gaussians there are
+    /// fewer steps, because a step takes longer and more of its effect is removed later.
     fn steps_before(&self, left: usize, wanted: usize) -> usize {
         (self.steps_per_prune as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
     }
 
     /// Returns the minimum fraction of all Gaussians with which refinement begins, before its prune steps remove the
     /// surplus; `None` if there are no prune steps.
-    pub fn start_fraction(&self) -> Option<f64> {
+    pub fn min_start_fraction(&self) -> Option<f64> {
         self.prunes.then_some(MIN_START_FRACTION)
     }
 
     /// Returns the number of Gaussians with which refinement begins, given that it ends with `wanted` of the `all`
     /// Gaussians of the model. Prune steps remove the difference.
     pub fn initial_count(&self, wanted: usize, all: usize) -> usize {
-        start_count(self.start_fraction(), wanted, all)
+        start_count(self.min_start_fraction(), wanted, all)
     }
 
     /// Estimates the memory and time that this stage needs for the input `work`: frame states, the optimizer, and a
@@ -304,16 +306,15 @@ impl RefineStage {
     }
 }
 
-/// Returns the number of Gaussians with which refinement begins: `wanted`, the number with which it ends, or the
-/// fraction `starts_at` of the `all` Gaussians of the model, if that is more. Prune steps remove the surplus. If
-/// `starts_at` is `None`, there are no prune steps, and the result is `wanted`.
+/// Returns the number of Gaussians with which refinement begins. If there are prune steps, it is the larger of
+/// `wanted`, the number with which refinement ends, and the fraction `starts_at` of the `all` Gaussians of the model;
+/// prune steps then remove the surplus. Without prune steps (`starts_at` is `None`), it is `wanted`.
 pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }
 
-/// Returns the number of optimization steps of the time-varying delta (values that refinement adds to each frame): two
-/// thirds of `steps`, the number of steps of the constant delta (values that refinement adds to the stored parameters),
-/// which is optimized first.
+/// Returns the number of optimization steps of the trajectory delta (values that vary with time), which is optimized
+/// after the constant delta: two thirds of `steps`, the number of steps of the constant delta.
 fn along_time(steps: usize) -> usize {
     2 * steps / 3
 }
@@ -322,7 +323,7 @@ fn along_time(steps: usize) -> usize {
 /// `first` to `last` Gaussians.
 fn prune_counts(first: usize, last: usize) -> Vec<usize> {
     let ratio = last.max(1) as f64 / first.max(1) as f64;
-    let step_count = (ratio.ln() / MIN_PRUNE_FRACTION.ln() - 1e-9).ceil().max(0.0) as usize;
+    let step_count = (ratio.ln() / MIN_KEPT_FRACTION.ln() - 1e-9).ceil().max(0.0) as usize;
     let after = |k: usize| (first as f64 * ratio.powf(k as f64 / step_count as f64)).round() as usize;
     let mut prune_counts: Vec<usize> = std::iter::once(first).chain((1..step_count).map(after)).collect();
     prune_counts.extend((step_count > 0).then_some(last));

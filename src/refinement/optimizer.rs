@@ -15,12 +15,12 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, sh_coeffic
 const BETAS: [f32; 2] = [0.9, 0.999];
 /// Small term in the denominator of Adam's update, against division by 0.
 const EPSILON: f32 = 1e-15;
-/// Number of first steps during which learning rates grow to full size, because Adam's running means are still
-/// unreliable.
-const WARM_UP: usize = 10;
-/// Initial error of the renders at or above which learning rates have full size. The error is the geometric mean of the
-/// root mean square errors of the views, with color values from 0 to 1. For a smaller initial error the rates are
-/// reduced in proportion, so that nearly correct parameters are not disturbed.
+/// Number of steps at the beginning during which learning rates grow to full size, because Adam's running means are not
+/// reliable yet.
+const WARM_UP_STEPS: usize = 10;
+/// Error of the renders at the start at or above which learning rates have full size. For a smaller error the rates are
+/// reduced in proportion, so that nearly correct parameters are not disturbed. The error is the geometric mean of the
+/// root mean square errors of the views, with color values from 0 to 1.
 const FULL_ERROR: f64 = 0.036;
 
 /// Factor on all learning rates as a function of the optimization step.
@@ -45,7 +45,7 @@ impl RateSchedule {
 
     /// Returns the factor on all learning rates for the step that follows `done` steps.
     fn at(&self, done: usize) -> f32 {
-        let [warm, late] = [(done + 1) as f32 / WARM_UP as f32, done as f32 / self.steps.max(1) as f32];
+        let [warm, late] = [(done + 1) as f32 / WARM_UP_STEPS as f32, done as f32 / self.steps.max(1) as f32];
         self.factor * warm.min(1.0) * self.last.powf(late)
     }
 }
@@ -56,9 +56,9 @@ pub struct Adam {
     change: ParamDelta,
     /// Running mean of the derivatives, and running mean of the squared derivatives.
     means: [Gaussians; 2],
-    /// Two lists of factors on the learning rates, with one factor per Gaussian. First list: for positions, 0.04 times
-    /// the geometric mean of the scales of the Gaussian, scene units. Second list: for all other attributes, 1. Both
-    /// factors are 0 for Gaussians that are not optimized.
+    /// Two lists of factors on the learning rates, each with one factor per Gaussian. First list: factors for
+    /// positions, 0.04 · (geometric mean of the scales of the Gaussian), in scene units. Second list: factors for all
+    /// other attributes, 1. Both factors are 0 for Gaussians that are not optimized.
     reach: [Vec<f32>; 2],
     columns: Attributes,
     done: usize,
@@ -164,8 +164,8 @@ impl Adam {
     }
 }
 
-/// Returns the learning rate of component `c` of the attribute `column`. For positions it is 1, because their learning
-/// rate is given by `Adam::reach`, which depends on the size of the Gaussian.
+/// Returns the learning rate of component `c` of the attribute `column`. For positions it is 1, because `Adam::reach`
+/// contains their learning rate, which depends on the size of the Gaussian.
 fn rate(column: Attributes, c: usize) -> f32 {
     match column {
         Attributes::POSITION => 1.0,

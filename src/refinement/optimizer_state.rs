@@ -49,11 +49,12 @@ pub(super) const REEVALUATE_EVERY: usize = 200;
 /// the frames of the target views, and the delta (change of the parameters since the start of refinement).
 ///
 /// If the model has a deformation field, a frame state is not simply the stored parameters plus a delta. Each state is
-/// then evaluated anew every [`REEVALUATE_EVERY`] steps and extrapolated along its Jacobian in between. Evaluating the
-/// field and its derivative at every step would take three times as long and gain nothing (method.md, section 6.2).
+/// then evaluated anew every [`REEVALUATE_EVERY`] steps, and extrapolated with its derivatives (Jacobian) in between.
+/// Evaluating the field and its derivatives at every step would take three times as long and gain nothing (method.md,
+/// section 6.2).
 ///
-/// Memory: six frame states, [`Adam`], and a view with its gradient. A scratch file holds one state per frame. If few
-/// Gaussians are visible in a frame, its state in the file has only these.
+/// Memory: six frame states, [`Adam`], and a view with its gradient. A scratch file holds one state per frame; for a
+/// frame in which few Gaussians are visible, only the states of these.
 pub(super) struct OptimizerState<'a> {
     scene: &'a Scene,
     targets: &'a Targets,
@@ -66,13 +67,12 @@ pub(super) struct OptimizerState<'a> {
     /// Stored parameters, without the delta (change of these parameters) of `constant_optimizer`. Used only if the
     /// model has a deformation field.
     stored: StoredParams,
-    /// Part of the constant delta (change of the stored parameters since the start of refinement) that is already
-    /// included in the parameters `stored` and in the frame states `linearized`. The other part is the delta of
-    /// `constant_optimizer`.
+    /// Part of the constant delta (change of the stored parameters since the start of refinement) that `stored` and the
+    /// frame states `linearized` already include. The rest is the delta of `constant_optimizer`.
     baked_delta: ParamDelta,
     fixed: Vec<bool>,
-    /// Settings of optimization steps, without the attributes and SH degrees that the model does not have or whose
-    /// derivatives its deformation field cannot compute.
+    /// Settings of optimization steps. Attributes and SH degrees are left out if the model does not have them, or if
+    /// its deformation field cannot compute their derivatives.
     step_params: StepParams,
     constant_optimizer: Adam,
     /// One optimizer per keyframe of the time-varying delta (values that refinement adds to each frame); empty if the
@@ -104,7 +104,7 @@ type OptimizerCheckpoint<Stored, Added, Means> =
     (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
 
 /// Contents of a checkpoint ([`OptimizerCheckpoint`]), read back from the cache.
-pub(super) type KeptCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
+pub(super) type LoadedCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
 
 impl<'a> OptimizerState<'a> {
     /// Creates the optimizer state for a pruned model whose frames `result` reads. Only Gaussians for which `fixed` is
@@ -175,15 +175,15 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Replaces the optimizer of the stored parameters, `constant_optimizer`, by a new one for the Gaussians that are
-    /// left; its delta (change of the parameters) is 0. Also sets `stride`, the stride of the rendered pixels of
-    /// training views, according to the number of these Gaussians (see [`Loss::stride`]).
+    /// left. Its delta (change of the parameters) is 0. Also sets `stride`, the stride of the rendered pixels of
+    /// training views, for this number of Gaussians (see [`Loss::stride`]).
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
         let StepParams { columns, sh_degree, loss } = self.step_params;
         self.constant_optimizer = Adam::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
-        // A multiple of the stride of the stored values.
+        // A multiple of the stride at which the target views are stored.
         let (pixels, stored) = (self.scene.workload().pixels, self.targets.stride());
         let wanted = loss.stride(pixels, state.len());
         let multiple = NonZeroU32::new(wanted.get() / stored).unwrap_or(NonZeroU32::MIN);
@@ -257,13 +257,14 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Frees the buffers of the renderer that the optimization steps use. The memory plan counts either them, or what a
-    /// deformation field computes without time, or the renderers of [`OptimizerState::removal_error`].
+    /// Frees the buffers of the renderer that the optimization steps use. The memory plan counts only one of three
+    /// amounts, which are therefore never in memory together: these buffers, the time-independent results of a
+    /// deformation field, and the renderers of [`OptimizerState::removal_error`].
     fn free_buffers(&mut self) {
         self.renderer = Renderer::on_all_threads();
     }
 
-    /// Returns the state of the optimizer for a checkpoint, from which [`OptimizerState::resume`] continues.
+    /// Returns the contents of a checkpoint, from which [`OptimizerState::resume`] continues.
     pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
         let reevaluated = self.reevaluated.then_some((&self.stored, &self.baked_delta));
         let keyframe_optimizers = self.keyframe_optimizers.iter().map(Adam::checkpoint).collect();
@@ -279,7 +280,7 @@ impl<'a> OptimizerState<'a> {
     /// Fails if a scratch file cannot be written.
     pub(super) fn resume(
         &mut self,
-        (reevaluated, constant_optimizer, steps, keyframe_optimizers): KeptCheckpoint,
+        (reevaluated, constant_optimizer, steps, keyframe_optimizers): LoadedCheckpoint,
     ) -> Result<()> {
         if let Some((stored, baked_delta)) = reevaluated {
             self.constant_optimizer.take_delta();
@@ -340,7 +341,7 @@ impl<'a> OptimizerState<'a> {
         let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
         let mut now = std::mem::take(&mut self.now);
         for k in 0..self.frames.len() {
-            self.show(k, &mut now)?;
+            self.compute_state(k, &mut now)?;
             linearized.push(&mut now.pick(places))?;
         }
         (self.linearized, self.now) = (linearized.finish()?, now);
@@ -357,7 +358,7 @@ impl<'a> OptimizerState<'a> {
 
     /// Computes into `now` the current state of the frame with index `k` in `self.frames`, including all changes that
     /// refinement has made so far.
-    fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
+    fn compute_state(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
         let change = self.constant_optimizer.delta();
         match &now.present {
@@ -401,7 +402,7 @@ impl<'a> OptimizerState<'a> {
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
-    pub(super) fn step_along(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
+    pub(super) fn step_trajectory(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
         self.differentiate(k)?;
         // Attributes that do not vary with time in the input get no time-varying delta.
         for column in self.step_params.columns.iter() {
@@ -423,7 +424,7 @@ impl<'a> OptimizerState<'a> {
     fn differentiate(&mut self, k: usize) -> Result<()> {
         let (target, view) = (self.targets.values(k, self.stride)?, self.targets.view(k, self.stride));
         let mut now = std::mem::take(&mut self.now);
-        self.show(self.frame_index(k), &mut now)?;
+        self.compute_state(self.frame_index(k), &mut now)?;
         self.gradients.clear();
         let StepParams { columns, sh_degree, loss } = self.step_params;
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
@@ -444,7 +445,7 @@ impl<'a> OptimizerState<'a> {
     /// Fails if a scratch file cannot be read.
     pub(super) fn quality(&self, views: &[usize]) -> Result<RenderQuality> {
         let errors = |(renderer, now): &mut (Renderer, LinearizedState), &k: &usize| {
-            self.show(self.frame_index(k), now)?;
+            self.compute_state(self.frame_index(k), now)?;
             let (view, values) = (self.targets.view(k, self.stride), self.targets.values(k, self.stride)?);
             let picture = renderer.render(&now.state, view, self.scene.background);
             Ok(self.step_params.loss.errors(&picture, &values))
@@ -464,7 +465,7 @@ impl<'a> OptimizerState<'a> {
         let zero = || (self.new_worker(), RemovalError::new(self.fixed.len(), contrast_floor));
         let add_view = |((mut renderer, mut now), mut errors): ((Renderer, LinearizedState), RemovalError),
                         &k: &usize| {
-            self.show(self.frame_index(k), &mut now)?;
+            self.compute_state(self.frame_index(k), &mut now)?;
             let mut sparse = now.present.as_ref().map(|present| RemovalError::new(present.len(), contrast_floor));
             let found = sparse.as_mut().unwrap_or(&mut errors);
             let view = self.targets.view(k, self.stride);

@@ -1,7 +1,7 @@
-//! Pruned models of a search for the smallest sufficient number of Gaussians. Models between two prune steps are kept,
-//! so that the search can make smaller models from them instead of from the beginning.
+//! Collection of pruned models, for a search for the smallest sufficient number of Gaussians. Models between two prune
+//! steps are kept, so that the search can make smaller models from them instead of from the beginning.
 
-use super::{MIN_PRUNE_FRACTION, RefineRun};
+use super::{MIN_KEPT_FRACTION, RefineRun};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -52,9 +52,9 @@ impl<'a> PrunedModels<'a> {
 }
 
 /// Returns how many of `count` Gaussians the next prune step keeps, if `wanted` are to remain in the end. This is the
-/// fraction [`MIN_PRUNE_FRACTION`] of `count`, but at least `wanted`, and less than `count`.
+/// fraction [`MIN_KEPT_FRACTION`] of `count`, but at least `wanted`, and less than `count`.
 fn next_size(count: usize, wanted: usize) -> usize {
-    ((MIN_PRUNE_FRACTION * count as f64).ceil() as usize).min(count - 1).max(wanted)
+    ((MIN_KEPT_FRACTION * count as f64).ceil() as usize).min(count - 1).max(wanted)
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::loss::RenderQuality;
 use super::optimizer::RateSchedule;
-use super::optimizer_state::{KeptCheckpoint, OptimizerState, keyframe_count};
+use super::optimizer_state::{LoadedCheckpoint, OptimizerState, keyframe_count};
 use super::survivors::survivors;
 use super::targets::{Targets, ViewSplit};
 use super::{MAX_USEFUL_PSNR, NAME, NO_GAIN, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
@@ -32,14 +32,14 @@ const CHECKPOINT_INTERVAL: [Duration; 2] = [Duration::from_millis(100), Duration
 /// Minimum gain in validation PSNR, dB, for which deltas that vary with time are kept; a smaller gain is not worth the
 /// bytes that these deltas take.
 const MIN_KEYFRAME_GAIN: f64 = 0.01;
-/// Factor applied to the learning rates when the optimization steps since the last validation have lowered the quality
-/// of the validation views.
+/// Factor applied to the learning rates when the optimization steps since the last validation have not improved the
+/// quality of the validation views.
 const RATE_REDUCTION: f32 = 0.3;
 /// Learning rate at the last optimization step of a phase, divided by the learning rate at its first step. First value:
-/// steps before a prune step; second value: final steps.
+/// phase of the steps before a prune step; second value: phase of the final steps.
 const LAST_RATES: [f32; 2] = [1.0, 0.5];
-/// Fraction of the final steps, taken from their end, over which the parameters are averaged. The mean is closer to the
-/// optimum than the parameters after a single step, which scatter around it.
+/// Fraction of the final steps, taken from their end, over which the parameters are averaged. The parameters after
+/// single steps scatter around the optimum; their mean is closer to it.
 const AVERAGED_FRACTION: f64 = 0.4;
 /// Number of optimization steps between two parameter deltas that are averaged.
 const AVERAGE_EVERY: usize = 4;
@@ -84,12 +84,12 @@ impl RefineStage {
     }
 
     /// Refines the model `reduction` to `wanted` Gaussians like [`RefineStage::run`], as part of the stage named
-    /// `stage`, with the target views `targets`. Returns only the mean PSNR, dB, of the result against the original on
-    /// the validation views.
+    /// `stage`, with the target views `targets`. Returns only the mean PSNR, dB, of the refined model against the
+    /// original on the validation views.
     ///
     /// # Errors
     /// Fails like [`RefineStage::run`].
-    pub(crate) fn closeness(
+    pub(crate) fn validation_psnr(
         &self,
         stage: &'static str,
         scene: &Scene,
@@ -172,7 +172,7 @@ struct CheckpointTimer {
 #[derive(Serialize, Deserialize)]
 struct ResumePoint<Checkpoint, Best> {
     phase: usize,
-    /// Number of optimization steps that the phase (part of refinement) had done when the checkpoint was written.
+    /// Number of optimization steps of this phase that were done when the checkpoint was written.
     steps: usize,
     taken: usize,
     schedule: RateSchedule,
@@ -192,7 +192,8 @@ struct BestState<Delta, Trajectory> {
     constant: RenderQuality,
     /// Constant delta (values added to the stored parameters) that has had the best validation quality so far.
     delta: Delta,
-    /// Factor on the learning rates, reduced whenever the validation quality became worse.
+    /// Factor on the learning rates, reduced at each validation (except the last) that shows no better quality than the
+    /// best so far.
     rate_factor: f32,
     /// Trajectory delta: the time-varying values, added to each frame, that have had the best validation quality so far
     /// together with `delta`.
@@ -200,8 +201,8 @@ struct BestState<Delta, Trajectory> {
     mean: MeanDelta<Delta>,
 }
 
-/// Mean of the parameter deltas (values that refinement adds to the parameters) over the last optimization steps, of
-/// which every [`AVERAGE_EVERY`]-th counts.
+/// Mean of parameter deltas (values that refinement adds to the parameters). One delta is taken after every
+/// [`AVERAGE_EVERY`]-th of the last optimization steps.
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct MeanDelta<Delta> {
     delta: Delta,
@@ -210,7 +211,7 @@ struct MeanDelta<Delta> {
 }
 
 impl MeanDelta<ParamDelta> {
-    /// Includes `next` in the mean: the values that refinement adds to the parameters after one more step.
+    /// Includes the parameter delta `next` in the mean.
     fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;
         let part = 1.0 / self.count as f32;
@@ -373,7 +374,7 @@ impl<'a> RefineRun<'a> {
     /// Restores the optimizer and the position in the random order of views from the last checkpoint of the current
     /// phase of `timer`. Returns the progress of this phase, or `None` if there is no checkpoint of it.
     fn resume(&mut self, optimizer: &mut OptimizerState<'_>, timer: &CheckpointTimer) -> Result<Option<Resumed>> {
-        let kept: Option<ResumePoint<KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
+        let kept: Option<ResumePoint<LoadedCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
             self.scene.work.load(&self.checkpoint_name(), timer.key)?;
         let Some(kept) = kept.filter(|kept| kept.phase == timer.phase) else { return Ok(None) };
         optimizer.resume(kept.checkpoint)?;
@@ -406,9 +407,9 @@ impl<'a> RefineRun<'a> {
         Ok(())
     }
 
-    /// Runs `steps` optimization steps, then removes all but `size` Gaussians from `optimizer`; mainly those stay whose
-    /// removal would cause the largest squared error (see [`survivors`]). Returns the indices of the Gaussians that
-    /// stay.
+    /// Runs `steps` optimization steps, then removes all but `size` Gaussians from `optimizer`. Mainly those Gaussians
+    /// stay whose removal would cause the largest squared errors (see [`survivors`]). Returns the indices of the
+    /// Gaussians that stay.
     fn prune_step(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -417,7 +418,7 @@ impl<'a> RefineRun<'a> {
         size: usize,
     ) -> Result<Vec<u32>> {
         let (name, key, work) = (format!("{}-cut-{:02}", self.stage, timer.phase + 1), timer.key, &self.scene.work);
-        let kept: Option<(KeptCheckpoint, Vec<u32>, usize)> = work.load(&name, key)?;
+        let kept: Option<(LoadedCheckpoint, Vec<u32>, usize)> = work.load(&name, key)?;
         let left = match kept {
             Some((checkpoint, left, taken)) => {
                 optimizer.resume(checkpoint)?;
@@ -528,14 +529,14 @@ impl<'a> RefineRun<'a> {
         Ok(best_state)
     }
 
-    /// Runs the optimization steps of the time-varying delta (values added to each frame). They follow the `steps`
-    /// steps of the constant delta (values added to the stored parameters). Stores the best deltas in `best_state`.
-    /// `done`: number of steps of both deltas in the loaded checkpoint; 0 without a checkpoint.
+    /// Runs the optimization steps of the time-varying delta (values added to each frame), and stores the best deltas
+    /// in `best_state`. These steps follow the `steps` steps of the constant delta (values added to the stored
+    /// parameters). `done`: number of steps of both deltas in the loaded checkpoint; 0 without a checkpoint.
     /// - If `done` is above `steps`, continues from the checkpoint with the learning rates `schedule`.
     /// - Otherwise starts from the best constant delta.
     ///
-    /// Returns false if no step was run: no attribute may vary with time, or the PSNR is at least [`MAX_USEFUL_PSNR`]
-    /// already.
+    /// Returns false if no step was run: either no attribute may vary with time, or the PSNR is at least
+    /// [`MAX_USEFUL_PSNR`] already.
     fn refine_along_time(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -554,12 +555,12 @@ impl<'a> RefineRun<'a> {
             if !optimizer.enable_keyframes(keyframe_count) {
                 return Ok(false);
             }
-            // Every view changes the two keyframes around its frame, so a keyframe makes this many steps on average.
+            // Every view changes the two keyframes around its frame, so this is the mean number of steps per keyframe.
             schedule = RateSchedule::new(2 * keyframe_steps / keyframe_count, LAST_RATES[1], best_state.constant.error);
         }
         let validate_every = keyframe_steps.div_ceil(3);
         for step in done.saturating_sub(steps) + 1..=keyframe_steps {
-            optimizer.step_along(self.sampler.next(), &schedule)?;
+            optimizer.step_trajectory(self.sampler.next(), &schedule)?;
             self.progress.advance(1);
             if step % validate_every == 0 || step == keyframe_steps {
                 let now = optimizer.quality(&self.validation)?;

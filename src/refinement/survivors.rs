@@ -4,22 +4,23 @@ use crate::merging::tree::{NearestPoints, Tree, TreePoint};
 use crate::model::AttributeValues;
 
 /// Number of candidates for removal, as a multiple of the number of Gaussians to remove.
-const CANDIDATES: f64 = 1.6;
+const CANDIDATE_RATIO: f64 = 1.6;
 
 /// Returns the indices of the `count` Gaussians that a prune step keeps, in increasing order. `errors` are the removal
 /// errors of all Gaussians (the squared error of renders without the Gaussian), `fixed` marks Gaussians that must stay
 /// if possible, and `positions` are the centers of the Gaussians in scene units.
-///
 /// Gaussians are removed in order of increasing error; of equal errors, the higher index goes first. A removed Gaussian
 /// protects its nearest neighbor: each error assumes that all other Gaussians remain, so two neighbors that cover for
-/// each other would otherwise both be removed. Only the Gaussians with the smallest errors are candidates,
-/// [`CANDIDATES`] times as many as have to be removed. If too few of them are unprotected, Gaussians are then removed
-/// in the same order without regard to protection.
+/// each other would otherwise both be removed.
+///
+/// Only the Gaussians with the smallest errors are candidates, [`CANDIDATE_RATIO`] times as many as have to be removed.
+/// If too few of the candidates are unprotected, more Gaussians are removed in the same order without regard to
+/// protection.
 pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions: &AttributeValues) -> Vec<u32> {
     let removed_count = errors.len().saturating_sub(count);
     let mut ranked: Vec<u32> = (0..errors.len() as u32).collect();
     ranked.sort_by_key(|&i| (fixed[i as usize], errors[i as usize], std::cmp::Reverse(i)));
-    let candidates = &ranked[..((CANDIDATES * removed_count as f64) as usize).min(ranked.len())];
+    let candidates = &ranked[..((CANDIDATE_RATIO * removed_count as f64) as usize).min(ranked.len())];
     let point = |index: u32| TreePoint { at: positions.row(index as usize), index };
     let mut points: Vec<TreePoint> = (0..errors.len() as u32).map(point).collect();
     points.retain(|point| point.at.iter().all(|x| x.is_finite()));

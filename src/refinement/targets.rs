@@ -29,8 +29,8 @@ const MAX_SCENE_VIEWS: usize = 60;
 const PHOTOGRAPH_PART: [usize; 2] = [20, 26];
 /// Maximum number of target views that are photographs.
 const MAX_PHOTOGRAPHS: usize = 400;
-/// In a refinement toward photographs: number of renders of the original from new cameras, divided by the number of
-/// photographs (numerator and denominator). These renders keep the result from overfitting the photographs.
+/// In a refinement toward photographs, [a, b] means: for every b photographs, a renders of the original from new
+/// cameras are added as target views. They keep the result from overfitting the photographs.
 const RENDERS_PER_PHOTOGRAPH: [usize; 2] = [3, 10];
 /// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
 /// exceed it.
@@ -43,12 +43,12 @@ const VALIDATION_VIEWS: usize = 32;
 /// Minimum n in "one of every n target views is a validation view": at most one view in eight is used for validation.
 const MIN_VALIDATION_EVERY: usize = 8;
 
-/// Number n by which validation photographs are chosen: they are the photographs of one in n cameras. If fewer than n
-/// cameras have photographs, they are one in n photographs.
+/// Number n by which validation photographs are chosen: the photographs of one in n cameras. If fewer than n cameras
+/// have photographs, one in n photographs is chosen instead.
 const VALIDATION_CAMERA_EVERY: usize = 8;
 
-/// Number n for test views: one of every n target views is a test view. Only runs with a quality target have test
-/// views, which they use only for the reported quality.
+/// Number n: one of every n target views is a test view. Only runs with a quality target have test views, which serve
+/// only to report the quality.
 const TEST_EVERY: usize = 4;
 
 /// Indices of the target views, divided by the purpose of the view.
@@ -62,16 +62,17 @@ pub(crate) struct ViewSplit {
     pub(crate) test: Vec<usize>,
 }
 
-/// Returns two numbers of target views: from the scene's cameras, and from new cameras. Their sum is at most
-/// `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
+/// Returns two numbers of target views: the number from the scene's cameras, and the number from new cameras. Their sum
+/// is at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
     let count = total_count(max_views, pixels);
     let own = fraction(SCENE_VIEW_PART, count).min(MAX_SCENE_VIEWS);
     [own, count - own]
 }
 
-/// Returns two numbers of target views if some show photographs: photographs, and renders from new cameras. Their sum is
-/// at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
+/// Returns two numbers of target views if some of them show photographs: the number of photographs, and the number of
+/// renders from new cameras. Their sum is at most `max_views`, and smaller if so many views of `pixels` pixels would
+/// exceed [`MAX_BYTES`].
 pub(super) fn photograph_counts(max_views: usize, pixels: u64) -> [usize; 2] {
     let photographs = fraction(PHOTOGRAPH_PART, total_count(max_views, pixels)).min(MAX_PHOTOGRAPHS);
     [photographs, fraction(RENDERS_PER_PHOTOGRAPH, photographs)]
@@ -88,9 +89,9 @@ fn fraction([part, of]: [usize; 2], count: usize) -> usize {
     part * count / of
 }
 
-/// Target views in a scratch file: renders of the original model, or photographs. Their cameras are the cameras by which
-/// Gaussians are scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the rig. Of a
-/// training view only the pixels of a grid are stored; of validation and test views, all pixels are.
+/// Target views in a scratch file: renders of the original model, or photographs. Their cameras are the cameras by
+/// which Gaussians are scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the
+/// rig. Training views are stored only at the pixels of a grid; validation and test views are stored as a whole.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
@@ -106,13 +107,14 @@ pub(crate) struct Targets {
     values: Vec<(Range<usize>, Spill)>,
 }
 
-/// Fraction of the new cameras of target views (renders that refinement fits) that are placed outside the rig, if
-/// [`Scene::outside`] is 1. The other new cameras are placed between two cameras of the scene. A camera is outside the
-/// rig if it sees the scene from a new direction, one that does not lie between the directions of the scene's cameras.
+/// If [`Scene::outside`] is 1, this fraction of the new cameras of target views (renders that refinement fits) is
+/// placed outside the rig. The other new cameras are placed between two cameras of the scene. For other values of
+/// [`Scene::outside`], the fraction is in proportion to it.
 ///
-/// [`Scene::outside`] is the weight, from 0 to 1, of the quality of renders from such new directions. The fraction of
-/// cameras is in proportion to it.
-const OUTSIDE_SHARE: f64 = 0.5;
+/// [`Scene::outside`] is the weight, from 0 to 1, of the quality of renders from outside the rig. A camera is outside
+/// the rig if it sees the scene from a new direction, one that does not lie between the directions of the scene's
+/// cameras.
+const OUTSIDE_FRACTION: f64 = 0.5;
 
 /// Purpose of a target view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -167,7 +169,7 @@ impl Targets {
                 let camera = cameras_with_photographs.binary_search(&picture.camera).unwrap_or_default();
                 camera % VALIDATION_CAMERA_EVERY == VALIDATION_CAMERA_EVERY / 2
             }
-            // Another place in every group of photographs, so that all cameras of a small rig take part.
+            // Chooses another position in every group of n photographs, so that all cameras of a small rig take part.
             false => k % VALIDATION_CAMERA_EVERY == k / VALIDATION_CAMERA_EVERY % VALIDATION_CAMERA_EVERY,
         };
         let frame_and_view = |picture: &FrameView| (picture.frame, picture.view);
@@ -246,9 +248,9 @@ impl Targets {
     }
 
     /// Returns the grid of the pixels of view `k` that are rendered and compared. For a training view, these are the
-    /// pixels at every `stride`-th column and row; for validation and test views, all pixels. The first column and row
-    /// come from a hash of `k`, so that different training views sample different pixels. `stride` must be a multiple
-    /// of [`Targets::stride`].
+    /// pixels in every `stride`-th column and row; the first column and row come from a hash of `k`, so that different
+    /// training views sample different pixels. For validation and test views, these are all pixels. `stride` must be a
+    /// multiple of [`Targets::stride`].
     fn grid(&self, k: usize, stride: NonZeroU32) -> PixelGrid {
         match self.purposes[k] {
             Purpose::Training => {
@@ -329,7 +331,7 @@ fn add_new_views(scene: &Scene, mut pictures: Vec<FrameView>, between_views: usi
     let (seen, mut random) = (pictures.len(), SplitMix64(2));
     let rig = scene.rig_cameras();
     let more_views = if seen == 0 { 0 } else { between_views };
-    let outer_views = (OUTSIDE_SHARE * scene.outside * more_views as f64) as usize;
+    let outer_views = (OUTSIDE_FRACTION * scene.outside * more_views as f64) as usize;
     let outer = cameras_outside(&rig, outer_views, 1.0 + scene.outside);
     let inner = cameras_between(&rig, more_views - outer.len());
     for camera in outer.into_iter().chain(inner) {

@@ -284,7 +284,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
 }
 
 #[test]
-fn without_bands_higher_sh_degrees_stay() {
+fn fixed_higher_sh_degrees_stay_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let recipe = Recipe::preset("default").unwrap();

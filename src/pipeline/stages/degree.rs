@@ -95,7 +95,7 @@ impl Degree {
                     sh_degree: fit.sh_degree,
                     ..template.with_kept(ranked.best_ids(first(fit.gaussians)))
                 };
-                let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
+                let psnr = self.refine.validation_psnr(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));
                 if is_no_better {
