@@ -161,10 +161,10 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 fn pictures(criterion: &mut Criterion) {
-    let demo = DemoScene::new(DemoScene::COUNT, DemoScene::FRAMES);
+    let demo = DemoScene::new(DemoScene::DEFAULT_COUNT, DemoScene::DEFAULT_FRAMES);
     let mut state = Gaussians::zeros(0, demo.info().sh_degree);
     let everything = Ids::Range(0..demo.info().count);
-    demo.open(everything).unwrap().read(DemoScene::FRAMES / 2, Attributes::all(), &mut state).unwrap();
+    demo.open(everything).unwrap().read(DemoScene::DEFAULT_FRAMES / 2, Attributes::all(), &mut state).unwrap();
     measure(criterion, "picture", "demo", &state, &demo.rig().cameras[0]);
     let Some(folder) = models::found() else { return };
     for name in models::NAMES {

@@ -523,10 +523,10 @@ pub(super) struct Demo {
     #[arg(short, long, value_name = "FOLDER", default_value = "splatsieve-demo")]
     pub(super) output: PathBuf,
     /// Number of Gaussians of the generated scene
-    #[arg(long, value_name = "N", default_value_t = Playground::COUNT as u32, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
+    #[arg(long, value_name = "N", default_value_t = Playground::DEFAULT_COUNT as u32, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
     pub(super) gaussians: u32,
     /// Number of frames of the generated scene
-    #[arg(long, value_name = "T", default_value_t = Playground::FRAMES as u32, value_parser = clap::value_parser!(u32).range(2..=10_000))]
+    #[arg(long, value_name = "T", default_value_t = Playground::DEFAULT_FRAMES as u32, value_parser = clap::value_parser!(u32).range(2..=10_000))]
     pub(super) frames: u32,
     /// Optimization steps of each refinement [default: enough for the usual scene]
     #[arg(long, value_name = "N")]

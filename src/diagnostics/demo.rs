@@ -102,8 +102,8 @@ pub struct DemoReport {
     pub models: Vec<DemoModel>,
     /// Number of renders (test views at all frames) over which PSNR and SSIM are averaged.
     pub renders: usize,
-    /// Written files, each as a pair of its path in the output folder and a description, in the order in which a person
-    /// may want to open them.
+    /// Written files, each with its path in the output folder and a description, in the order in which a user may want
+    /// to open them.
     pub written: Vec<(&'static str, &'static str)>,
 }
 

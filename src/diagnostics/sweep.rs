@@ -162,7 +162,7 @@ fn merge_only_count(found: &TradeOff) -> Option<usize> {
     found.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
-/// Returns whether a run of `method` with the kept fraction `fraction` cannot succeed: the method is merging without
+/// Returns whether a run of `method` with the kept fraction `fraction` is known to fail: the method is merging without
 /// pruning, and the points in `found` show that merging alone leaves more Gaussians than this fraction. Such a run is
 /// skipped.
 fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {

@@ -26,7 +26,7 @@ pub(crate) struct WholeRun<'a> {
     pub(crate) scratch: &'a Path,
     /// File name of the result, which determines the output format.
     pub(crate) name: &'a str,
-    /// Maximum number and maximum total time of the runs by which the time of one setting is measured.
+    /// Limits on the number and the total time of the runs that measure the time of one setting.
     pub(crate) repeats: RepeatLimits,
     /// Maximum number of frames at which the result is compared with the original, evenly spaced; `None`: all frames.
     pub(crate) max_frames: Option<usize>,

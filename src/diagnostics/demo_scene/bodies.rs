@@ -30,9 +30,9 @@ pub enum DemoBody {
     Egg,
     /// Cloth that is held at its left edge and waves at its right edge: neighboring Gaussians move differently.
     Cloth,
-    /// Cloud without motion, whose Gaussians each fade from opaque to invisible or from invisible to opaque. So its
-    /// opacities vary, and each Gaussian is alive in only a part of the frames; its positions are as constant as those
-    /// of a wall.
+    /// Cloud without motion. Each of its Gaussians fades from opaque to invisible or from invisible to opaque. So its
+    /// opacities vary, and each Gaussian is alive in only a part of the frames; its positions are constant, as those of
+    /// a wall.
     Fading,
     /// Flying sparks, each visible for an eighth of the sequence around its own time. The life spans of many sparks do
     /// not overlap. A spark does not move outside of its life span.
@@ -71,7 +71,7 @@ impl DemoBody {
         }
     }
 
-    /// Returns the number of Gaussians of this body in a scene of 1000 Gaussians.
+    /// Returns the number of Gaussians of this body per 1000 Gaussians of the scene.
     const fn share(self) -> usize {
         match self {
             DemoBody::Wall => 400,
@@ -224,7 +224,7 @@ fn fading(dice: GaussianRandom) -> DemoGaussian {
 fn spark(dice: GaussianRandom) -> DemoGaussian {
     let position = DVec3::new(0.9, -0.5, 0.1);
     let velocity = DVec3::new(2.0 * dice.signed(0), 2.0 * dice.signed(1), dice.between(2, 3.0, 5.0));
-    // The peak lies where the whole life fits into the sequence.
+    // The peak is at a time at which the whole life span of the spark fits into the sequence.
     let motion =
         DemoMotion::Spark { peak: dice.between(3, HALF_LIFE, 1.0 - HALF_LIFE), half_life: HALF_LIFE, velocity };
     DemoGaussian { motion, ..still(position, DQuat::IDENTITY, [0.02; 3], BRIGHT, color([1.0, 0.8, 0.3], dice)) }

@@ -46,7 +46,7 @@ const HELD_OUT: u32 = 2;
 /// use splatsieve::diagnostics::demo_scene::{DemoBody, DemoScene};
 /// use splatsieve::source::FrameSource;
 ///
-/// let scene = DemoScene::new(DemoScene::COUNT, DemoScene::FRAMES);
+/// let scene = DemoScene::new(DemoScene::DEFAULT_COUNT, DemoScene::DEFAULT_FRAMES);
 /// assert_eq!(scene.info().times.len(), 48);
 /// assert!(scene.body_ids(DemoBody::Cloth).len() > 400);
 /// ```
@@ -58,9 +58,9 @@ pub struct DemoScene {
 
 impl DemoScene {
     /// Default number of Gaussians of the generated scene.
-    pub const COUNT: usize = 6000;
+    pub const DEFAULT_COUNT: usize = 6000;
     /// Default number of frames of the generated scene.
-    pub const FRAMES: usize = 48;
+    pub const DEFAULT_FRAMES: usize = 48;
 
     /// Creates the scene with `count` Gaussians and `frames` frames at evenly spaced times from 0 to 1. Every value of
     /// `count` and `frames` is valid, including 0.

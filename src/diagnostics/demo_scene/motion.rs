@@ -33,13 +33,13 @@ pub(super) enum DemoMotion {
     /// Motion of the Gaussians of the egg, which runs along three quarters of an ellipse and spins once. `position` and
     /// `rotation` of the Gaussian are relative to the egg.
     Egg,
-    /// Displacement along y by a wave that runs through a cloth or flag. `along` is the position of the Gaussian across
-    /// the cloth: 0 at the edge where it is held, 1 at its free edge.
+    /// Motion of the Gaussians of a cloth or flag, through which a wave runs: displacement along y. `along` is the
+    /// position of the Gaussian across the cloth, from 0 at the edge where it is held to 1 at its free edge.
     Wave { along: f64 },
     /// No motion, but a linear change of the opacity logit, by `rate` per unit of time.
     Fade { rate: f64 },
-    /// Flight of a spark, which is visible from the time `peak - half_life` to the time `peak + half_life`. In this
-    /// time it falls under gravity, starting with `velocity`, in scene units per unit of time.
+    /// Flight of a spark, which is visible from the time `peak - half_life` to the time `peak + half_life`. It starts
+    /// with the velocity `velocity` (scene units per unit of time) and falls under gravity in this time.
     Spark { peak: f64, half_life: f64, velocity: DVec3 },
     /// Rotation by `angle` radians over the sequence about the axis through `pivot` that is parallel to y.
     Turn { pivot: DVec3, angle: f64 },
@@ -68,6 +68,7 @@ pub(super) const BRIGHT: f64 = 3.0;
 /// Half the time in which a spark is visible, as a fraction of the sequence. With 1/16, a spark is visible for an
 /// eighth of the sequence.
 pub(super) const HALF_LIFE: f64 = 1.0 / 16.0;
+/// Acceleration of a flying spark toward the ground, scene units per squared unit of time.
 const GRAVITY: f64 = 12.0;
 /// Radius of the ball, scene units.
 pub(super) const BALL_RADIUS: f64 = 0.34;
@@ -155,14 +156,16 @@ impl GaussianRandom {
     }
 }
 
-/// Index of the random number ([`GaussianRandom`]) by which the color of a Gaussian is a little brighter or darker. It
+/// Index of the random number ([`GaussianRandom`]) that makes the color of a Gaussian a little brighter or darker. It
 /// is large because the indices that single objects use for other numbers start at 0.
-const TINT: u64 = 100;
-/// First index of the random numbers ([`GaussianRandom`]) by which the color of a Gaussian depends a little on the view
-/// direction. It is large because the indices that single objects use for other numbers start at 0.
-const SHEEN: u64 = 200;
+const BRIGHTNESS_INDEX: u64 = 100;
+/// Offset of the indices of the random numbers ([`GaussianRandom`]) from which the SH coefficients of degree 1 are
+/// made. They let the color of a Gaussian depend a little on the view direction. Coefficient `at` of the 12
+/// coefficients (3 to 11 have degree 1) uses the random number with the index `VIEW_COLOR_INDEX + at`. The offset is
+/// large because the indices that single objects use for other numbers start at 0.
+const VIEW_COLOR_INDEX: u64 = 200;
 
-/// Returns a Gaussian without motion that has the given attributes. `scale`: standard deviations along its axes, scene
+/// Returns a Gaussian with the given attributes that does not move. `scale`: standard deviations along its axes, scene
 /// units.
 pub(super) fn still(
     position: DVec3,
@@ -175,17 +178,17 @@ pub(super) fn still(
     DemoGaussian { position, rotation, opacity_logit, motion: DemoMotion::Still, log_scale, sh }
 }
 
-/// Returns SH coefficients of degree 1 for the color `rgb`, whose components are in [0, 1]. Random numbers of the
-/// Gaussian, from `dice`, change its brightness a little and add a slight dependence on the view direction.
+/// Returns the 12 SH coefficients up to degree 1 for the color `rgb`, whose components are in [0, 1]. Random numbers of
+/// the Gaussian, from `dice`, change its brightness a little and let its color depend slightly on the view direction.
 pub(super) fn color(rgb: [f64; 3], dice: GaussianRandom) -> [f32; 12] {
     std::array::from_fn(|at| match at {
-        0..3 => ((rgb[at] + 0.02 * dice.signed(TINT) - 0.5) / SH_C0) as f32,
-        _ => (0.04 * dice.signed(SHEEN + at as u64)) as f32,
+        0..3 => ((rgb[at] + 0.02 * dice.signed(BRIGHTNESS_INDEX) - 0.5) / SH_C0) as f32,
+        _ => (0.04 * dice.signed(VIEW_COLOR_INDEX + at as u64)) as f32,
     })
 }
 
-/// Returns point `k` of a sequence in the unit square whose first n points are spread evenly for every n (sequence R2
-/// of Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
+/// Returns point `k` of a sequence of points in the unit square. Its first n points are spread evenly, for every n
+/// (sequence R2 of Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
 pub(super) fn spread(k: usize) -> DVec2 {
     const PLASTIC: f64 = 1.324_717_957_244_746;
     let k = k as f64;

@@ -83,7 +83,7 @@ enum PlaygroundObject {
 /// use splatsieve::diagnostics::demo_scene::Playground;
 /// use splatsieve::source::FrameSource;
 ///
-/// let scene = Playground::new(Playground::COUNT, Playground::FRAMES);
+/// let scene = Playground::new(Playground::DEFAULT_COUNT, Playground::DEFAULT_FRAMES);
 /// assert_eq!(scene.info().count, 20_000);
 /// assert_eq!(scene.rig().cameras.len(), 12);
 /// ```
@@ -94,9 +94,9 @@ pub struct Playground {
 
 impl Playground {
     /// Default number of Gaussians of the generated scene.
-    pub const COUNT: usize = 20_000;
+    pub const DEFAULT_COUNT: usize = 20_000;
     /// Default number of frames of the generated scene.
-    pub const FRAMES: usize = 48;
+    pub const DEFAULT_FRAMES: usize = 48;
 
     /// Creates the scene with `count` Gaussians and `frames` frames at evenly spaced times from 0 (included) to 1
     /// (excluded).
@@ -165,8 +165,8 @@ struct SurfacePoint {
     motion: DemoMotion,
 }
 
-/// Returns Gaussian `k` (from 0) of the `n` Gaussians that form the surface of `object`. Its random numbers come from
-/// `dice`.
+/// Returns Gaussian `k` (from 0) of the `n` Gaussians that form the surface of `object`. `dice`: source of its random
+/// numbers.
 fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     let point = match object {
         PlaygroundObject::Sky => sky(k, n),
@@ -193,8 +193,8 @@ fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) 
     DemoGaussian { motion: point.motion, ..made }
 }
 
-/// Returns point `k` of a sequence on the unit sphere whose first n points are spread evenly for every n. So each of n
-/// points represents an area of 4π/n on the sphere.
+/// Returns point `k` of a sequence of points on the unit sphere. Its first n points are spread evenly, for every n. So
+/// each of n points represents an area of 4π/n on the sphere.
 fn on_sphere(k: usize) -> DVec3 {
     let DVec2 { x: turn, y: height } = spread(k);
     let z = 2.0 * height - 1.0;
@@ -208,7 +208,7 @@ fn sky(k: usize, n: usize) -> SurfacePoint {
     let direction = DVec3::new(cos, sin, 0.0) * (1.0 - height * height).sqrt() + DVec3::Z * height;
     let mix = height.sqrt();
     let rgb = [(0.88, 0.40), (0.93, 0.63), (0.97, 0.93)].map(|(low, high)| low + (high - low) * mix);
-    // Larger than their share, so that no gap is left between so few.
+    // Each Gaussian is larger than its share of the sky, so that the few Gaussians leave no gaps.
     let area = 1.6 * TAU * HORIZON * HORIZON / n as f64;
     SurfacePoint { position: HORIZON * direction, normal: -direction, rgb, area, motion: DemoMotion::Still }
 }
@@ -445,7 +445,7 @@ mod tests {
 
     #[test]
     fn every_camera_sees_a_full_render_that_changes_with_time() {
-        let scene = Playground::new(Playground::COUNT, 12);
+        let scene = Playground::new(Playground::DEFAULT_COUNT, 12);
         let [first, later] = [0, 5].map(|frame| state(&scene, frame));
         for camera in &scene.rig().cameras {
             let [a, b] = [&first, &later].map(|state| render(state, camera, [1.0, 0.0, 1.0]));

@@ -18,7 +18,7 @@ fn film(scene: &DemoScene, body: DemoBody) -> Vec<Gaussians> {
 }
 
 fn usual() -> DemoScene {
-    DemoScene::new(DemoScene::COUNT, DemoScene::FRAMES)
+    DemoScene::new(DemoScene::DEFAULT_COUNT, DemoScene::DEFAULT_FRAMES)
 }
 
 fn point(column: &AttributeValues, i: usize) -> DVec3 {
@@ -63,7 +63,7 @@ fn gaussian_and_frame_give_the_same_bits_in_any_block() {
 
 #[test]
 fn scene_of_any_size_is_finite_with_unit_rotations() {
-    for (count, frames) in [(0, 3), (1, 1), (2, 2), (3, 2), (17, 3), (1000, 7), (DemoScene::COUNT, 3), (5, 0)] {
+    for (count, frames) in [(0, 3), (1, 1), (2, 2), (3, 2), (17, 3), (1000, 7), (DemoScene::DEFAULT_COUNT, 3), (5, 0)] {
         let scene = DemoScene::new(count, frames);
         assert_eq!((scene.info().count, scene.info().times.len()), (count, frames));
         assert!(scene.info().times.is_sorted_by(|a, b| a < b));
@@ -255,7 +255,7 @@ fn only_wanted_columns_are_written() {
 }
 
 #[test]
-fn what_the_scene_does_not_have_is_refused() {
+fn missing_gaussians_and_frames_are_refused() {
     let scene = DemoScene::new(10, 2);
     assert!(scene.open(Ids::Range(5..11)).err().unwrap().to_string().contains("no Gaussian 10"));
     assert!(scene.open(Ids::List(&[3, 99])).err().unwrap().to_string().contains("no Gaussian 99"));

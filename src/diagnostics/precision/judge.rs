@@ -33,8 +33,8 @@ pub(super) struct JudgedQuality {
 }
 
 impl Judge {
-    /// Renders the held-out (test) views of `scene`, or all views if none are held out: at most [`MAX_VIEWS`] of them,
-    /// evenly spaced. Returns these renders as the reference for [`Judge::quality`].
+    /// Renders the held-out views of `scene` (test views, else validation views), or all views if none are held out: at
+    /// most [`MAX_VIEWS`] of them, evenly spaced. Returns these renders as the reference for [`Judge::quality`].
     ///
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.
@@ -106,7 +106,7 @@ mod tests {
 
     #[test]
     fn squared_errors_and_decibels_are_averaged() {
-        // These PSNRs are root mean square errors of a tenth and of a hundredth of the range.
+        // The root mean square errors of these PSNRs are a tenth and a hundredth of the range of colors.
         let JudgedQuality { error, psnr } = JudgedQuality::from_psnr(&[20.0, 40.0]);
         assert!((error - (0.5f64 * (0.01 + 0.0001)).sqrt()).abs() < 1e-15, "{error}");
         assert_eq!((psnr, JudgedQuality::from_psnr(&[f64::INFINITY]).error), (30.0, 0.0));

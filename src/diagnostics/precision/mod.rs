@@ -54,8 +54,8 @@ pub enum Knob {
     /// Parameters of the pruning rounds (rank, remove the lowest, repeat): the number of views per round, and the
     /// fraction of the Gaussians that a round keeps.
     Rounds,
-    /// Number of mantissa bits of the histogram with which percentiles are found in one pass over the values. More bits
-    /// mean more precise percentiles.
+    /// Number of mantissa bits of a value that choose its bin in a histogram. Percentiles are found from this histogram
+    /// in one pass over the values. More bits mean narrower bins and more precise percentiles.
     Percentiles,
     /// Arithmetic of the sums that the scan (pass over all frames for the statistics) accumulates: f32, f32 with
     /// compensation, or f64.
@@ -87,9 +87,9 @@ impl Knob {
         }
     }
 
-    /// Returns a text for the user that says why this knob (parameter that `precision` varies) could not be measured:
-    /// what the scene or the recipe lacks. Each knob has only one possible reason.
-    fn needs(self) -> &'static str {
+    /// Returns a text for the user that says why this knob (parameter that `precision` varies) was not measured: what
+    /// the scene or the recipe lacks. Each knob has only one possible reason.
+    fn reason_not_run(self) -> &'static str {
         match self {
             Knob::Sums => "sums over frames need three frames",
             Knob::Refining => "the recipe refines nothing",
@@ -130,7 +130,7 @@ pub struct PrecisionOptions {
 /// run again.
 const MAX_SETTING_SECONDS: f64 = 10.0;
 
-/// Maximum size of a model (number of Gaussians × number of frames) at which `precision` by default also varies those
+/// Maximum size of a model (number of Gaussians × number of frames) at which `precision` by default also varies the
 /// parameters whose effect is measured by complete runs of the program.
 const MAX_STATES_OF_WHOLE_RUNS: u64 = 10_000_000;
 
@@ -203,7 +203,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         for need in &mut needs {
             need.per_gaussian.push(("settings", HELD_BYTES));
             need.fixed.extend([("judged", Judge::bytes(work.pixels)), ("counts", SKETCH_BYTES)]);
-            need.fixed.push(("thinned", thinned_bytes(work, options.max_frames)));
+            need.fixed.push(("thinned", thinned_schedule_bytes(work, options.max_frames)));
         }
         needs
     })?;
@@ -225,7 +225,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     let measure = MeasureStages::new(&options.recipe, true, UserOverrides::default());
     let scanned = measure.scan(&scene, &mut Journal::default())?;
     let judge = Judge::new(&scene)?;
-    // The progress of hundreds of stages would hide which setting is being measured.
+    // Progress of the hundreds of stages would hide which setting is measured, so it is not shown.
     scene.events = Events::IGNORED;
     let bench = Bench {
         scanned,
@@ -260,7 +260,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     for knob in chosen {
         match bench.measure_knob(knob)? {
             Some(knob) => found.knobs.push(knob),
-            None => found.notes.push(format!("{}: not run, because {}", knob.name(), knob.needs())),
+            None => found.notes.push(format!("{}: not run, because {}", knob.name(), knob.reason_not_run())),
         }
     }
     write_files(&found, staged.path())?;
@@ -349,11 +349,12 @@ fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
 }
 
 /// Returns the bytes of memory of the new schedule (list of views per frame) that [`thin_frames`] makes for at most
-/// `most` frames. It has two entries for each frame that keeps its views: one for this frame, and one for the frames
-/// without views after it. Returns 0 if the input has at most `most` frames: then there is no new schedule.
-fn thinned_bytes(work: &Workload, most: usize) -> u64 {
-    let most = most.max(1) as u64;
-    if work.frames <= most { 0 } else { ViewSchedule::bytes(2 * most, work.views) }
+/// `max_frames` frames. It has two entries for each frame that keeps its views: one for this frame, and one for the
+/// frames without views after it. Returns 0 if the input has at most `max_frames` frames: then there is no new
+/// schedule.
+fn thinned_schedule_bytes(work: &Workload, max_frames: usize) -> u64 {
+    let max_frames = max_frames.max(1) as u64;
+    if work.frames <= max_frames { 0 } else { ViewSchedule::bytes(2 * max_frames, work.views) }
 }
 
 #[cfg(test)]
@@ -382,9 +383,9 @@ mod tests {
     fn thinned_schedules_are_counted_in_memory() {
         let info = SequenceInfo { count: 1, times: vec![0.0; 1000], sh_degree: 0, varying: Attributes::empty() };
         let work = Workload { views: 3, ..Workload::new(&info, MemoryProfile::for_tiles(1)) };
-        assert_eq!((thinned_bytes(&work, 1000), thinned_bytes(&work, 5000)), (0, 0));
+        assert_eq!((thinned_schedule_bytes(&work, 1000), thinned_schedule_bytes(&work, 5000)), (0, 0));
         // At least two ranges of 16 bytes, and a pair of 8 bytes for every view.
-        assert!(thinned_bytes(&work, 60) >= 60 * (2 * 16 + 3 * 8));
-        assert!(thinned_bytes(&work, 0) > 0);
+        assert!(thinned_schedule_bytes(&work, 60) >= 60 * (2 * 16 + 3 * 8));
+        assert!(thinned_schedule_bytes(&work, 0) > 0);
     }
 }

@@ -25,36 +25,38 @@ use crate::statistics::score::{PercentilePasses, ScoredQuantity, Scores, score_w
 /// Numbers of views that are tried for the first ranking and for a pruning round. Numbers that exceed the number of
 /// views of the scene are skipped.
 const VIEW_COUNTS: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
-/// Maximum number of views per pruning round that is tried.
+/// Largest number of views per pruning round that is tried.
 const MOST_IN_ROUNDS: usize = 400;
 /// Strides of pixels, views and frames that are tried. With a stride of n, every n-th is used.
 const STRIDES: [u32; 4] = [16, 8, 4, 2];
 /// Values that are tried for the fraction of the Gaussians that a pruning round keeps.
 const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
-/// Values that are tried for the number of mantissa bits of the histogram from which percentiles are found.
+/// Numbers of mantissa bits that are tried for the histogram from which percentiles are found. More bits mean narrower
+/// bins.
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MAX_MANTISSA_BITS];
 
 /// Result of ranking the Gaussians with one value of the varied parameter.
-/// - `value`: this value of the parameter
-/// - `step`: number h ≥ 0 that states how coarse the value is, as the mesh width of a numerical method does: for
-///   example 1/n for n views, or n for a stride of n. An error of order p is proportional to h^p.
-/// - `cost`: time and memory of the ranking
-/// - `kept`: ids of the Gaussians that the ranking keeps
 struct TriedRanking {
+    /// Value of the varied parameter.
     value: f64,
+    /// Step size h ≥ 0 of this value: how coarse it is, like the mesh width of a numerical method. For example, 1/n for
+    /// n views, or n for a stride of n. An error of order p is proportional to h^p.
     step: f64,
+    /// Time and memory of the ranking.
     cost: Cost,
     /// Errors of this ranking, by name. Errors that compare `kept` with the Gaussians that the finest setting keeps are
     /// added later, by [`Bench::curve`].
     errors: BTreeMap<String, f64>,
+    /// Ids of the Gaussians that the ranking keeps.
     kept: Vec<u32>,
 }
 
-/// One setting to measure: a recipe in which one parameter has the value `value`. `step` is a positive number h that
-/// states how coarse this value is, as the mesh width of a numerical method does: for example 1/n for n views, n for a
-/// stride of n. An error of order p is proportional to h^p.
+/// One setting to measure: a recipe in which one parameter has the value `value`.
 struct RankingVariant {
+    /// Value of the varied parameter in `recipe`.
     value: f64,
+    /// Step size h > 0 of this value: how coarse it is, like the mesh width of a numerical method. For example, 1/n for
+    /// n views, or n for a stride of n. An error of order p is proportional to h^p.
     step: f64,
     recipe: Recipe,
 }
@@ -75,7 +77,7 @@ impl Bench<'_> {
         let (finest, cost) = self.contributions_with_cost(&variant(1.0, 1.0, &|_| ()).recipe)?;
         let Some(finest) = finest else { return Ok(None) };
         let own = Some(self.recipe.scan.scoring_views).filter(|&own| own > 0 && own < all).unwrap_or(all);
-        let counts = tried(VIEW_COUNTS.into_iter().chain([own]).filter(|&count| count < all));
+        let counts = sorted_distinct(VIEW_COUNTS.into_iter().chain([own]).filter(|&count| count < all));
         let counts =
             counts.into_iter().map(|n| variant(n as f64, 1.0 / n as f64, &|scan| scan.scoring_views = n)).collect();
         let last = (all as f64, 1.0 / all.max(1) as f64);
@@ -175,7 +177,7 @@ impl Bench<'_> {
         let most = self.scene.schedule.pair_count().min(MOST_IN_ROUNDS);
         let own_views = own.round_views.min(most);
         let mut by_views = Vec::new();
-        for count in tried(VIEW_COUNTS.into_iter().filter(|&count| count < most).chain([own_views, most])) {
+        for count in sorted_distinct(VIEW_COUNTS.into_iter().filter(|&count| count < most).chain([own_views, most])) {
             let select = recipe::SelectParams { round_views: count, ..own.clone() };
             by_views.push(self.rank_by(&scored, &select, count as f64, 1.0 / count as f64)?);
         }
@@ -203,9 +205,9 @@ impl Bench<'_> {
     }
 
     /// Ranks the Gaussians in pruning rounds with the parameters `select`, starting from the scores `scored`. Returns
-    /// the ids of the kept Gaussians and the cost (time and memory); the list of errors is empty. `value`: value of the
-    /// varied parameter in `select`. `step`: step size h of this value, its coarseness; an error of order p is
-    /// proportional to h^p.
+    /// the ids of the kept Gaussians and the cost (time and memory); the list of errors is empty.
+    /// - `value`: value of the varied parameter in `select`
+    /// - `step`: step size h of this value (how coarse it is); an error of order p is proportional to h^p
     fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
@@ -249,7 +251,7 @@ impl Bench<'_> {
         let own = f64::from(MAX_MANTISSA_BITS + 1);
         tried.push(measured(own, 0.0, &exact, cost)?);
         let against = "exact percentiles from two passes, as in every run (the last mark)";
-        // The error is at most half a bucket of the histogram, and each bit halves the buckets.
+        // The error is at most half the width of a bucket of the histogram, and each mantissa bit halves this width.
         let curve = self.curve("mantissa bits", against, tried, Some(own), &[(PERCENTILE_ERROR, 1.0)])?;
         Ok(PrecisionKnob {
             name: "percentiles".to_owned(),
@@ -297,7 +299,7 @@ impl Bench<'_> {
 }
 
 /// Returns the distinct values of `counts` in increasing order.
-fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
+fn sorted_distinct(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     let mut counts: Vec<usize> = counts.collect();
     counts.sort_unstable();
     counts.dedup();
@@ -311,8 +313,8 @@ fn relative_error(count: usize, expected: usize) -> f64 {
 
 /// Returns the largest relative error of the percentiles P1 and P99 in `scores`, by which the terms of the scores (such
 /// as motion) are normalized. `exact` holds the correct percentiles. The percentiles of the static and dynamic scores
-/// are left out: these scores combine several terms, so they differ between `scores` and `exact` before any percentile
-/// is taken.
+/// are left out: these scores combine several terms, so their values already differ between `scores` and `exact` before
+/// a percentile is taken of them.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
     let pairs = pairs.filter(|(term, _)| !matches!(term.quantity, ScoredQuantity::Static | ScoredQuantity::Dynamic));

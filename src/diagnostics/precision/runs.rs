@@ -162,8 +162,9 @@ impl Bench<'_> {
     }
 
     /// Compresses the input by `recipe` in complete runs of the program. Returns the error of the result's renders,
-    /// their PSNR, and the cost (time and memory) of the runs. `value`: value of the varied parameter in `recipe`.
-    /// `step`: step size h of this value, its coarseness; an error of order p is proportional to h^p.
+    /// their PSNR, and the cost (time and memory) of the runs.
+    /// - `value`: value of the varied parameter in `recipe`
+    /// - `step`: step size h of this value (how coarse it is); an error of order p is proportional to h^p
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.views.iter().map(|picture| picture.loss.psnr).collect();
@@ -177,9 +178,10 @@ impl Bench<'_> {
         })
     }
 
-    /// Compresses `input` by `recipe` in complete runs of the program. Returns the cost (time and memory), and as error
-    /// 0 if the result has the digest `expected`, 1 if not. `value`: value of the varied parameter. In the call for the
-    /// first setting, `expected` is `None`; this call stores the digest of its result there.
+    /// Compresses `input` by `recipe` in complete runs of the program. Returns the cost (time and memory) and the error
+    /// [`DIFFERENT_BYTES`]: 0 if the result has the digest `expected`, 1 if not. `value`: value of the varied
+    /// parameter. In the call for the first setting, `expected` is `None`; this call stores the digest of its result
+    /// there.
     fn compare_bytes(
         &self,
         recipe: &Recipe,

@@ -21,8 +21,8 @@ use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan};
 const GAUSSIANS: usize = 64;
 /// Maximum number of different frames of the scene that are played, spaced evenly over all its frames.
 const MOST_FRAMES: usize = 240;
-/// Lengths, in frames, of the sequences for which sums are computed. A sequence plays the frames of the scene forward
-/// and backward again and again.
+/// Numbers of frames for which sums are computed. For each of them, a sequence plays the frames of the scene forward
+/// and backward again and again until it has this number of frames.
 const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 
 /// Description, in the results, of the reference with which sums are compared.
@@ -219,8 +219,8 @@ fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize)
     std::array::from_fn(|statistic| found.iter().map(|values| values[statistic]).collect())
 }
 
-/// Computes the same statistics as [`sum_statistics`], but by the code that `compress` uses ([`BlockScan`]). `changed`:
-/// attributes that change from frame to frame; the code may take all others from the frame before.
+/// Computes the same statistics as [`sum_statistics`] by the code that `compress` uses ([`BlockScan`]). `changed`:
+/// attributes that change from frame to frame; the code may take all other attributes from the frame before.
 fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Attributes) -> Result<SummedStatistics> {
     let times: Vec<f64> = (0..frames_played).map(|k| k as f64).collect();
     let mut schedule = ViewSchedule::default();

@@ -15,8 +15,8 @@ pub struct CaseResult {
     pub what: &'static str,
     /// Largest error that a correct program may have. Errors are relative, or in the unit that `what` names.
     pub bound: f64,
-    /// Largest error found. It is infinite or NaN (null in JSON) if a value is not a number or nothing could be
-    /// measured.
+    /// Largest error found. It is infinite if a value is not a number or the case failed, and NaN if nothing was
+    /// compared; both are null in JSON.
     pub error: f64,
     /// Whether the error found is at most the bound.
     pub pass: bool,

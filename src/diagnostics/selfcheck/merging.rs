@@ -52,10 +52,13 @@ pub(super) fn needle() -> CaseResult {
     })
 }
 
-/// Compares a proxy (Gaussian that replaces merged ones) with its five members (the merged Gaussians): its mean and
-/// covariance with those of the mixture of the members, its SH coefficients with their weighted mean, and its opacity
-/// with 1 − Π(1 − α), where α are the opacities of the members. The members lie 1000 units from the origin, where the
-/// rounding of f64 changes their offsets by 1e-13. Returns the largest error, with the bound that it must not exceed.
+/// Compares a proxy (Gaussian that replaces merged ones) with its five members (the merged Gaussians):
+/// - its mean and covariance, with those of the mixture of the members
+/// - its SH coefficients, with the weighted mean of the members
+/// - its opacity, with 1 − Π(1 − α), where α are the opacities of the members
+///
+/// The members lie 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13. Returns the
+/// largest error, with the bound that it must not exceed.
 pub(super) fn proxy() -> CaseResult {
     CaseResult::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
         let mut states = random_gaussians(4, 5, 1);

@@ -15,9 +15,13 @@ use crate::render::{Contribution, Image, RemovalError, Renderer, render};
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
 /// Compares the render of one Gaussian with the formula of its pixels, α·c + (1 − α)·background with α =
-/// o·exp(−r²/(2(f²s²/z² + 0.3))). The Gaussian has the color c, the opacity o and the scale s and lies at the distance
-/// z; the pixel is r px from its center, and the focal length is f px. In f32, values of 1 have an error of 6e-8, and
-/// exponentials a little more. Returns the largest error, with the bound that it must not exceed.
+/// o·exp(−r²/(2(f²s²/z² + 0.3))).
+/// - Gaussian: color c, opacity o, scale s, at the distance z
+/// - Pixel: r px from the center of the Gaussian
+/// - Camera: focal length f px
+///
+/// In f32, values of 1 have an error of 6e-8, and exponentials a little more. Returns the largest error, with the bound
+/// that it must not exceed.
 pub(super) fn one_gaussian() -> CaseResult {
     CaseResult::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
@@ -39,9 +43,9 @@ pub(super) fn one_gaussian() -> CaseResult {
 }
 
 /// Compares a render of many Gaussians with the same render in f64, pixel by pixel. The program adds a few dozen values
-/// per pixel in f32. Skips the few pixels in which alpha or transmittance of a Gaussian is so close to a threshold of
-/// the renderer (relative difference below 1e-4) that f32 may decide differently. Returns the largest error, with the
-/// bound that it must not exceed.
+/// per pixel in f32. Skips the few pixels in which f32 may decide differently, because alpha or transmittance of a
+/// Gaussian is so close to a threshold of the renderer (relative difference below 1e-4). Returns the largest error,
+/// with the bound that it must not exceed.
 pub(super) fn many_gaussians() -> CaseResult {
     CaseResult::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
         let (scene, camera) = (random_gaussians(1, 300, 3), tilted_camera(67, 45));
@@ -146,7 +150,7 @@ pub(super) fn gradients() -> CaseResult {
         };
         Renderer::new().gradient(&scene, &camera, BACKGROUND, slope, &mut found);
 
-        // Which Gaussians each pixel blends is fixed beforehand, so that the loss is smooth.
+        // The list of Gaussians that each pixel blends is fixed beforehand, so that the loss is smooth.
         let blended = blended_indices(&scene, &camera);
         let loss = |changed: &Gaussians| -> f64 {
             let pixels = render_blended(changed, &camera, BACKGROUND, &blended);
@@ -193,11 +197,11 @@ pub(super) fn comparison() -> CaseResult {
     })
 }
 
-/// Seed of a scene for [`undoubtful_scene`], in whose render no alpha or transmittance is so close to a threshold of
-/// the renderer that f32 and f64 may decide differently.
+/// Seed of the random Gaussians of [`undoubtful_scene`]. With this seed, no alpha or transmittance in the render of the
+/// scene is so close to a threshold of the renderer that f32 and f64 may decide differently.
 const UNDOUBTFUL_SEED: u64 = 1;
 
-/// Returns a scene and a camera in whose render no alpha or transmittance is so close to a threshold of the renderer
+/// Returns a scene and a camera. In the render, no alpha or transmittance is so close to a threshold of the renderer
 /// that f32 may decide differently from f64, and no alpha is clamped.
 fn undoubtful_scene() -> (Gaussians, Camera) {
     let mut scene = random_gaussians(UNDOUBTFUL_SEED, 60, 1);

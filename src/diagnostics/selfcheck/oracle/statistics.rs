@@ -4,16 +4,20 @@
 use crate::model::{Camera, Gaussians, ViewSchedule};
 use crate::recipe::{MotionParams, ScanParams};
 
-/// Statistics of one Gaussian by the oracle (slow f64 reference): trajectory magnitude D, curvature κ, opacity variance
-/// V, number of frames in which the Gaussian is alive, contribution C in pixels, and visibility (fraction of all views
-/// in which the Gaussian is alive and touches the image).
+/// Statistics of one Gaussian by the oracle (slow f64 reference).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct OracleRow {
+    /// Trajectory magnitude D: root mean square step from frame to frame, scene units.
     pub(crate) d: f64,
+    /// Curvature κ: mean length of the second differences of the position, scene units.
     pub(crate) kappa: f64,
+    /// Variance V of the opacity over the frames in which the Gaussian is alive.
     pub(crate) v: f64,
+    /// Number of frames in which the Gaussian is alive (opacity ≥ alpha_min).
     pub(crate) life: u32,
+    /// Contribution C: projected area times opacity, pixels, mean over all views.
     pub(crate) c: f64,
+    /// Visibility: fraction of all views in which the Gaussian is alive and touches the image.
     pub(crate) vis: f64,
 }
 
