@@ -15,7 +15,7 @@ use super::options::{
 use super::output::{self, print, print_as};
 use super::progress::Display;
 use splatsieve::cache::{self, Completion};
-use splatsieve::commands::video::{side_by_side_text, video};
+use splatsieve::commands::video::{left_right_legend, video};
 use splatsieve::commands::{container, convert, render, score};
 use splatsieve::diagnostics::{demo, precision, selfcheck, sweep, test_scene};
 use splatsieve::error::{Error, Result, ShowPath};
@@ -123,7 +123,7 @@ fn run_render(mut args: Render, events: &Events) -> Result<()> {
             "fps": fps, "notes": filmed.notes,
         });
         let places =
-            options.beside.as_deref().map(|right| format!("  {}\n", side_by_side_text(&options.input.path, right)));
+            options.beside.as_deref().map(|right| format!("  {}\n", left_right_legend(&options.input.path, right)));
         let places = places.unwrap_or_default();
         let frames = filmed.frames;
         let text = || format!("{path}: {frames} frames of {width}x{height}, {fps} frames per second\n{places}");

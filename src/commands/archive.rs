@@ -58,7 +58,7 @@ pub fn unpack_archive(
     let with_layout = restored_output_kind(&content, path)?;
     match with_layout {
         Some(own) if own != kind => return Ok(None),
-        // Other archives hold a model folder or a PLY.
+        // An archive without a file layout holds a model folder or a PLY file.
         None if !matches!(kind, OutputKind::Model | OutputKind::Ply) => return Ok(None),
         _ => (),
     }

@@ -41,7 +41,7 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 /// Name of the packing stage, for progress and cache entries.
 const PACK_STAGE: &str = "pack";
 
-/// Precision with which `pack` stores values.
+/// Precision with which [`pack`] stores the values in a container.
 #[derive(Debug, Clone)]
 pub enum StoragePrecision {
     /// All values exact to the bit, with the given compression.
@@ -65,12 +65,12 @@ impl StoragePrecision {
     }
 }
 
-/// Packs any input into a container. The container of a stream holds no digest of its source, because the digest is
-/// known only after the header of the container is written.
+/// Packs any input into a container. A stream that needs no tracking is packed while it arrives. Its container holds no
+/// digest of it, because the digest is known only after the header of the container is written.
 ///
 /// # Errors
-/// Fails if the input cannot be read, if the output exists already or cannot be written, or if a bound is relative to
-/// the extent of a stream, which is known only at its end.
+/// Fails if the input cannot be read, if the output exists already or cannot be written, or if an error bound is
+/// relative to the extent of a stream, which is known only at its end.
 pub fn pack(
     input: &InputOptions,
     output: &Path,
@@ -132,7 +132,7 @@ fn pack_whole(
     let info = opened.input.source().info();
     let larger = ModelSize::from_frames(bytes).why_larger_than(&opened.input.size()?);
     let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
-    Ok(packed(output, info.count, info.times.len(), bytes, larger, notes))
+    Ok(container_report(output, info.count, info.times.len(), bytes, larger, notes))
 }
 
 /// Packs a frame stream into the container `output` while its frames arrive, and returns the report on the container.
@@ -156,12 +156,12 @@ fn pack_arriving(
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let larger = ModelSize::from_frames(bytes).why_larger_than(&ModelSize::from_frames(received));
-    Ok(packed(output, gaussians, frames, bytes, larger, Vec::new()))
+    Ok(container_report(output, gaussians, frames, bytes, larger, Vec::new()))
 }
 
 /// Returns the report on the container at the path `output`, which was just written. `bytes`: size of the container.
-/// `larger`: reason why the container is larger than the input; `None` if it is not.
-fn packed(
+/// `larger`: reason why the container is larger than the input; `None` if it is not larger.
+fn container_report(
     output: &Path,
     gaussians: usize,
     frames: usize,
@@ -293,7 +293,7 @@ fn pack_estimates(work: &Workload, storing: &StoragePrecision) -> Vec<ResourceEs
         StoragePrecision::Exact(Compression::Zstd(level)) | StoragePrecision::Within(_, level) => *level,
         StoragePrecision::Exact(_) => 0,
     };
-    // Bounds may need the extent of the scene, for which the positions of the first frame are read.
+    // Error bounds may be relative to the extent of the scene, which is computed from the positions of the first frame.
     let (together, positions) = match storing {
         StoragePrecision::Within(..) => (FRAME_BLOCK_WITH_ERROR_BOUNDS, 16),
         StoragePrecision::Exact(_) => (FRAME_BLOCK, 0),

@@ -98,8 +98,8 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
     scene.plan_memory(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
-        // Per pixel and model: the render, the joined frame (12), its bytes (3) and, for a GIF, the samples of its
-        // palette (5).
+        // Bytes per pixel and model, besides the render: the joined frame (12), its 8-bit values (3) and, for a GIF,
+        // the samples of its palette (5).
         let mut estimate = view_selection::render_estimate(work, limits, NAME, models, models * 12);
         estimate.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
         vec![estimate]
@@ -133,8 +133,8 @@ fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<
     Some(own)
 }
 
-/// Returns those shots (pairs of a camera and a time) in `all` that belong to the set `views`, sorted by view number,
-/// then time; shots without a time come first. Fails if there are none.
+/// Returns the shots (pairs of a camera and a time) in `all` that belong to the set `views`, sorted by view number,
+/// then by time; shots without a time come first. Fails if there are none.
 fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     let split = views.split(rig);
     let mut found: Vec<Shot> =
@@ -257,6 +257,6 @@ fn side_by_side(mut images: Vec<Image>) -> Image {
 }
 
 /// Returns a line of text that says which of two models a video shows on the left and which on the right.
-pub fn side_by_side_text(left: &Path, right: &Path) -> String {
+pub fn left_right_legend(left: &Path, right: &Path) -> String {
     format!("left: {}; right: {}", left.shown(), right.shown())
 }
