@@ -132,9 +132,9 @@ pub(super) struct Compress {
     pub(super) output: PathBuf,
     #[command(flatten)]
     pub(super) format: OutputFormat,
-    /// PSNR of an archive (NAME.gsz) against the result before quantization, such as 45dB [default: 9 dB above the PSNR
-    /// of the result against the original, at most 50dB; with 9 dB, quantization lowers the PSNR against the original
-    /// by about 0.5 dB]
+    /// PSNR of an archive (NAME.gsz) against the same result without quantization, such as 45dB [default: 9 dB above
+    /// the PSNR of the result against the original, at most 50dB; quantization then lowers the PSNR against the
+    /// original by about 0.5 dB]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
@@ -155,7 +155,7 @@ pub(super) struct Compress {
     pub(super) dry_run: Option<DryRun>,
     #[command(flatten)]
     pub(super) kept: CacheArgs,
-    /// Write a page, too, that plays the result beside the original, as `view` does [default: OUTPUT.html]
+    /// Also write a page that plays the result beside the original, as `view` does [default: OUTPUT.html]
     #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, hide_short_help = true)]
     #[arg(conflicts_with_all = ["dry_run", "shard"])]
     pub(super) view: Option<Option<PathBuf>>,
@@ -197,14 +197,14 @@ pub(super) struct OutputSize {
     pub(super) max_loss: Option<f64>,
     /// Folder of photographs: test views for --max-loss, training views for --toward
     ///
-    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of those of the test views is not used in the search
-    /// and gives the reported value.
+    /// File names: as in the camera file, else tNNN_vNN.png (frame, view). For --max-loss, the search uses three
+    /// quarters of the test views. The reported loss is measured on the other quarter.
     #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER")]
     pub(super) ground_truth: Option<PathBuf>,
     /// Images to fit the Gaussians to: renders of the original, or photographs in --ground-truth [default: renders]
     ///
-    /// With photographs, a second fit follows the one to renders. It is kept if it raises the PSNR against photographs
-    /// of cameras that are held back from it. It takes about as long as the first one.
+    /// With photographs, a second fit follows the one to renders. It takes about as long as the first one. Its result
+    /// is kept if it raises the PSNR against photographs of cameras that the fit does not use.
     #[arg(long, help_heading = HOW_SMALL, value_name = "IMAGES", hide_short_help = true)]
     pub(super) toward: Option<FitTargetArg>,
 }
@@ -212,13 +212,14 @@ pub(super) struct OutputSize {
 /// Gaussians that the user keeps or drops.
 #[derive(Debug, Args)]
 pub(super) struct OverrideArgs {
-    /// Keep every Gaussian whose center is inside this box at the reference frame, unmerged
+    /// Never remove, merge or move a Gaussian whose center is in this box at the reference frame. Box: minimum corner,
+    /// then maximum corner
     #[arg(long, help_heading = WHAT_STAYS, value_name = "X0,Y0,Z0,X1,Y1,Z1", hide_short_help = true, value_parser = parse_box, allow_hyphen_values = true)]
     pub(super) keep_box: Option<[f64; 6]>,
-    /// Keep these Gaussians, unmerged: a file with one id per line, or a list such as 3,10-20
+    /// Never remove, merge or move these Gaussians: a file with one id per line, or a list such as 3,10-20
     #[arg(long, help_heading = WHAT_STAYS, value_name = "FILE|IDS", hide_short_help = true)]
     pub(super) keep_ids: Option<String>,
-    /// Drop these Gaussians: a file with one id per line, or a list such as 3,10-20
+    /// Remove these Gaussians: a file with one id per line, or a list such as 3,10-20
     #[arg(long, help_heading = WHAT_STAYS, value_name = "FILE|IDS", hide_short_help = true)]
     pub(super) drop_ids: Option<String>,
 }
@@ -230,8 +231,8 @@ pub(super) struct ScoreArgs {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// rows.npz (arrays D kappa V life C E vis static_score dynamic_score score keep; W with visible
-    /// coverage) or rows.csv
+    /// Output, NAME.npz or NAME.csv: one row per Gaussian, with the columns D kappa V life C E vis static_score
+    /// dynamic_score score keep, and W if visible contributions are measured
     #[arg(short, long, value_name = "FILE")]
     pub(super) output: PathBuf,
     /// Print JSON
@@ -260,8 +261,8 @@ pub(super) struct Render {
     /// Render every view of the split into a folder, as tNNN_vNN files
     #[arg(long)]
     pub(super) all: bool,
-    /// Write a video with one image per frame: NAME.png or NAME.apng (animated PNG, lossless), NAME.gif, or NAME.mp4 or
-    /// NAME.webm (needs ffmpeg), from --view [default: the first] or along --path
+    /// Write a video with one image per frame, from --view [default: the first] or along --path. NAME.png or NAME.apng:
+    /// animated PNG, lossless. NAME.gif: animated GIF. NAME.mp4 or NAME.webm: video, needs ffmpeg
     #[arg(long, value_name = "FILE")]
     pub(super) video: Option<PathBuf>,
     /// Move the camera of --video through these views, such as 0,2,5 [default: all views of the split]
@@ -273,7 +274,7 @@ pub(super) struct Render {
     /// Model to show beside the input in --video, with the same frames
     #[arg(long, value_name = "MODEL")]
     pub(super) beside: Option<PathBuf>,
-    /// Split of the views [default: test with --all and --path, if there is one; else all]
+    /// Split of the views to render [default: with --all or --path test, else val, else all; otherwise all]
     #[arg(long, value_enum)]
     pub(super) split: Option<SplitArg>,
     /// Format of the images of --all [default: png]
@@ -281,7 +282,7 @@ pub(super) struct Render {
     pub(super) format: Option<ImageKind>,
     #[command(flatten)]
     pub(super) background: Background,
-    /// NAME.png (8 bits, clamped) or NAME.npy (float32 [H, W, 3], not clamped); with --all a folder
+    /// Output: NAME.png (8 bits, clamped), NAME.npy (float32 [H, W, 3], not clamped), or with --all a folder
     #[arg(short, long, value_name = "PATH", required_unless_present = "video", conflicts_with = "video")]
     pub(super) output: Option<PathBuf>,
     #[command(flatten)]
@@ -305,7 +306,7 @@ pub(super) enum ImageKind {
 /// Background color.
 #[derive(Debug, Args)]
 pub(super) struct Background {
-    /// Background color, each channel from 0 to 1 [default: that of the cameras, else of the model, else black]
+    /// Background color, each channel from 0 to 1 [default: as in the camera file, else as in the model, else black]
     #[arg(long, value_name = "R,G,B", value_parser = parse_color, allow_hyphen_values = true)]
     pub(super) background: Option<[f32; 3]>,
 }
@@ -335,7 +336,8 @@ pub(super) struct CompareArgs {
     /// Split of the views [default: test, else val, else all]
     #[arg(long, value_enum)]
     pub(super) split: Option<SplitArg>,
-    /// Folder with photographs to compare both models with: files as the cameras name them, else tNNN_vNN.png
+    /// Folder of photographs with which both models are also compared. File names: as in the camera file, else
+    /// tNNN_vNN.png
     #[arg(long, value_name = "FOLDER")]
     pub(super) ground_truth: Option<PathBuf>,
     /// Maximum number of frames, spread evenly [default: all]
@@ -417,7 +419,7 @@ pub(super) struct ViewArgs {
     pub(super) original_degree: Option<u8>,
     #[command(flatten)]
     pub(super) background: Background,
-    /// Maximum size of a single page; more is written as a folder
+    /// Maximum size of a page in one file; a larger page is written as a folder
     #[arg(long, value_name = "SIZE", default_value = DEFAULT_PAGE, value_parser = parse_bytes)]
     pub(super) page_limit: u64,
     /// Output: NAME.html, a single page, or a folder with index.html; both open without a server
@@ -445,9 +447,9 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd; a folder (the model in an archive,
-    /// a PLY per frame of a sequence, or a model of the input's own format); - for a frame stream on standard output
-    /// (format/STREAM.md)
+    /// Output. NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd: a file of this format. A
+    /// folder: the model in an archive, one PLY per frame of a sequence, or a model of the input's own format. `-`: a
+    /// frame stream on standard output (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// Path of the output: the same as the argument OUTPUT, in the form that other commands use
@@ -464,16 +466,15 @@ pub(super) struct Convert {
     pub(super) cameras: Cameras,
     #[command(flatten)]
     pub(super) format: OutputFormat,
-    /// Maximum error of an attribute in a .gseq: `position=1e-3` in the attribute's unit (scene units, components of
-    /// quaternions, logs of scales, opacity logits, SH coefficients) or `position=0.01%` of the scene's extent;
-    /// attributes that are not named keep every bit. Every value is checked as it is written, and the file states its
-    /// bounds
+    /// Maximum error of an attribute in a .gseq, such as `position=1e-3` or `position=0.01%` of the scene's extent.
+    /// Units: scene units, components of quaternions, logs of scales, opacity logits, SH coefficients. Attributes that
+    /// are not named keep every bit. Every value is checked as it is written, and the file states its bounds
     #[arg(long, value_name = "ATTRIBUTE=BOUND", value_delimiter = ',', conflicts_with = "raw")]
     pub(super) max_error: Vec<MaxError>,
-    /// Store the tiles of a .gseq uncompressed, for use in place
+    /// Store the blocks of values (tiles) of a .gseq uncompressed, so that programs can use them in place
     #[arg(long, conflicts_with = "level")]
     pub(super) raw: bool,
-    /// zstd level of a .gseq [default: 1, with --max-error 15]
+    /// zstd level of a .gseq [default: 1; with --max-error: 15]
     #[arg(long, value_name = "1-19", value_parser = clap::value_parser!(i32).range(1..=19))]
     pub(super) level: Option<i32>,
     #[command(flatten)]
@@ -528,7 +529,7 @@ pub(super) struct Demo {
     /// Number of frames of the generated scene
     #[arg(long, value_name = "T", default_value_t = Playground::DEFAULT_FRAMES as u32, value_parser = clap::value_parser!(u32).range(2..=10_000))]
     pub(super) frames: u32,
-    /// Optimization steps of each refinement [default: enough for the usual scene]
+    /// Optimization steps of each refinement [default: those of `--effort fast`]
     #[arg(long, value_name = "N")]
     pub(super) refine_steps: Option<u32>,
     #[command(flatten)]
@@ -574,7 +575,7 @@ pub(super) struct Selfcheck {
 /// Arguments of `recipe`.
 #[derive(Debug, Args)]
 pub(super) struct RecipeArgs {
-    /// `default`, `paper` (with a description of every parameter), `gentle` or `strong`
+    /// Preset to print: `default`, `paper` (describes every parameter), `gentle` or `strong`
     #[arg(long, default_value = "default")]
     pub(super) preset: String,
 }

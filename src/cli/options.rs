@@ -34,9 +34,9 @@ use splatsieve::progress::Events;
 use splatsieve::scene::view_selection::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
-/// Returns the library's request for the command `compress`. Options that the command line does not give are taken from
-/// the recipe file, if this file records the options of an earlier run. Unless `quiet` is set, the request asks the run
-/// to report its estimated time before it starts.
+/// Returns the library's request for the command `compress`. If the recipe file records the options of an earlier run,
+/// options that are not on the command line are taken from this record. Unless `quiet` is set, the run will report its
+/// estimated time before it starts.
 ///
 /// # Errors
 /// Fails if the recipe or the goal (a quality or a size on disk) is invalid, or if the recipe file records cameras,
@@ -52,13 +52,14 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
     if input.memory.tell == Verbosity::Nothing && !quiet {
         input.memory.tell = Verbosity::Time;
     }
-    // The recipe may come with the options of the run that it was written beside.
+    // A recipe file that a run wrote beside its result also records the options of this run.
     let run = match record.run {
         Some(run) => {
             if !has_split {
                 input.split = run.split;
             }
-            // The number of frames replaces the times of the cameras, so it is taken only with them.
+            // The recorded number of frames replaces the times of the recorded cameras, so it is used only with these
+            // cameras.
             if !has_cameras {
                 input.frames = input.frames.or(run.frames);
             }
@@ -327,7 +328,7 @@ pub(super) fn test_scene_options(args: TestScene, events: &Events) -> Result<Tes
 }
 
 /// Returns the compression and the error bounds with which `convert` stores the values of a container.
-pub(super) fn storing(args: &Convert) -> StoragePrecision {
+pub(super) fn storage_precision(args: &Convert) -> StoragePrecision {
     match (args.raw, args.max_error.clone()) {
         (true, _) => StoragePrecision::Exact(Compression::Raw),
         (_, bounds) if bounds.is_empty() => StoragePrecision::Exact(Compression::Zstd(args.level.unwrap_or(1))),

@@ -29,9 +29,9 @@ const MIN_BAR_COLUMNS: usize = 8;
 
 /// Receiver of the library's events, which displays them on standard error.
 pub(super) struct Display {
-    /// Whether to hide progress, and messages that the result of a stage is not used ([`Message::Discarded`]). Warnings
-    /// are always shown. Memory plans and time forecasts ([`Message::Plan`]) too, because they are sent only on
-    /// request.
+    /// Whether to hide progress, and messages that the result of a stage is not used ([`Message::Discarded`]). Two
+    /// kinds of messages are always shown: warnings, and memory plans with time forecasts ([`Message::Plan`]), which
+    /// are sent only on request.
     is_quiet: bool,
     shared: Arc<Shared>,
 }
@@ -67,7 +67,8 @@ impl Display {
         let bar = self.shared.bars.add(task.total.map_or_else(ProgressBar::no_length, ProgressBar::new));
         if let Ok(style) = ProgressStyle::with_template("{line}") {
             let (unit, shared) = (task.unit.to_owned(), self.shared.clone());
-            // The time left of the run is known only during a stage; the label of a stage has a number.
+            // Only the bar of a stage shows the time left of the run. The label of a stage differs from the task name:
+            // it begins with the number `[k/n]`.
             let is_stage = name != task.name;
             let line = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
                 let columns = Term::stderr().size_checked().map_or(DEFAULT_COLUMNS, |(_, columns)| columns);

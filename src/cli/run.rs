@@ -10,7 +10,8 @@ use super::help;
 use super::message::show;
 use super::options::{
     cache_request, compress_options, demo_options, evaluate_options, input_options, precision_options, render_options,
-    requested_kind, result_page_options, storing, sweep_options, test_scene_options, video_options, view_options,
+    requested_kind, result_page_options, storage_precision, sweep_options, test_scene_options, video_options,
+    view_options,
 };
 use super::output::{self, print, print_as};
 use super::progress::Display;
@@ -210,7 +211,7 @@ fn run_view(args: ViewArgs, events: &Events) -> Result<()> {
     print_result(as_json, &value, &found.notes, || page_text(&found) + "\n")
 }
 
-/// Writes the HTML page that plays a model, and prints notes about it to standard error. Returns a line of text with
+/// Writes the HTML page that plays a model, and shows the notes about it on standard error. Returns a line of text with
 /// the path and the size of the page.
 fn write_page(options: &ViewOptions) -> Result<String> {
     let found = view::view(options)?;
@@ -231,7 +232,7 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
         args.output.clone().or(args.output_option.clone()).ok_or_else(|| Error::internal("convert has no output"))?;
     let is_stdout = path.as_os_str() == "-";
     let is_stored_differently = args.raw || args.level.is_some() || !args.max_error.is_empty();
-    let storing = storing(&args);
+    let storing = storage_precision(&args);
     let output = (!is_stdout).then_some(path.as_path());
     let has_cache = args.kept.cache.is_some();
     let mut input = input_options(args.input, Some(args.cameras), output, events);

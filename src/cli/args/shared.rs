@@ -16,7 +16,7 @@ use splatsieve::pipeline::FitTarget;
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Input {
     /// Trained model (folder or checkpoint of any supported trainer), folder of PLY frames, .ply, .splatv, .gsz or
-    /// .gseq file, or - for a frame stream on standard input. See docs/inputs.md
+    /// .gseq file, or `-` for a frame stream on standard input. See docs/inputs.md
     pub(in crate::cli) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K", hide_short_help = true)]
@@ -41,12 +41,12 @@ pub(in crate::cli) struct Input {
 /// Facts about the training that a model's files do not contain.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Trained {
-    /// Length of time_duration of a 4D Gaussian Splatting checkpoint, or its ends A,B [default: as in a YAML file
-    /// beside it, else 10 if frame times exceed 1, else 1]
+    /// Time span of a 4D Gaussian Splatting checkpoint (its setting time_duration): the length L, or the ends A,B
+    /// [default: as in a YAML file beside it, else 10 if frame times exceed 1, else 1]
     #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration, allow_hyphen_values = true)]
     pub(in crate::cli) time_duration: Option<f64>,
-    /// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint: unflipped in code before 15 September 2024
-    /// [default: flipped]
+    /// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint. unflipped: trained with code from before 15
+    /// September 2024 [default: flipped]
     #[arg(long, value_name = "HOW", hide_short_help = true)]
     pub(in crate::cli) rot4d: Option<Rot4d>,
     /// Handling of Gaussians of a .splatv or .ftgs.ply whose quaternion is zero; players do not draw them [default:
@@ -55,7 +55,7 @@ pub(in crate::cli) struct Trained {
     pub(in crate::cli) zero_rotation: Option<ZeroRotationArg>,
 }
 
-/// Handling of zero quaternions of a .splatv.
+/// Handling of Gaussians of a .splatv or .ftgs.ply whose quaternion is zero.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum ZeroRotationArg {
     /// Remove Gaussians with a zero quaternion
@@ -64,12 +64,12 @@ pub(in crate::cli) enum ZeroRotationArg {
     Identity,
 }
 
-/// Layout of 4D rotations.
+/// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum Rot4d {
-    /// Order of both axes reversed
+    /// Rows and columns of the 4D rotation matrix in reverse order (code since 15 September 2024)
     Flipped,
-    /// Plain product of both quaternions
+    /// Product of both quaternions as it is (older code)
     Unflipped,
 }
 
@@ -109,7 +109,7 @@ pub(in crate::cli) struct Memory {
     /// summary says so.
     #[arg(long, help_heading = MACHINE, value_name = "SIZE", value_parser = parse_bytes)]
     pub(in crate::cli) memory: Option<u64>,
-    /// Print the plan before the run: stages, memory, time, reads; and at the end what was used
+    /// Print the plan before the run (stages, memory, time, reads), and the peak memory at the end
     #[arg(long, help_heading = MACHINE)]
     pub(in crate::cli) explain: bool,
 }
@@ -125,12 +125,12 @@ pub(in crate::cli) struct CameraFile {
     /// Number of evenly spaced frames, for a model that is continuous in time [default: the times of the cameras]
     #[arg(long, help_heading = CAMERAS, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(in crate::cli) frames: Option<u32>,
-    /// Width and height of the views where the cameras name none; views of COLMAP, NeRFies and LLFF are scaled to it
+    /// Width and height of the views, if the camera file has none; views of COLMAP, NeRFies and LLFF are scaled to it
     #[arg(long, help_heading = CAMERAS, value_name = "WxH", value_parser = parse_size)]
     pub(in crate::cli) resolution: Option<(u32, u32)>,
-    /// Times of images that have none (COLMAP, cameras.json): `names`, the numbers in their names; `none`, every camera
-    /// sees every frame; or a CSV file of name,time [default: names for COLMAP images with numbers and an input in
-    /// motion, else none]
+    /// Times of the images, if the camera file has none (COLMAP, cameras.json). names: the number in each image name.
+    /// none: every camera sees every frame. FILE: a CSV file of name,time [default: names for COLMAP images with
+    /// numbers and an input in motion, else none]
     #[arg(long, help_heading = CAMERAS, hide_short_help = true, value_name = "names|none|FILE", value_parser = parse_times)]
     pub(in crate::cli) times: Option<TimesSource>,
 }
@@ -152,7 +152,7 @@ pub(in crate::cli) enum LinkArg {
     Auto,
     /// Always, also for a container or a stream
     Always,
-    /// Always, but do not join tracks that seem to belong together, and store small changes too
+    /// Always, but do not join tracks that seem to show the same Gaussian, and store small changes too
     Apart,
     /// Never: the same index means the same Gaussian
     Never,
@@ -239,6 +239,6 @@ pub(in crate::cli) enum OutputKindArg {
     Tsog,
     /// Gaussians with linear motion in time windows, for ftgs-player (.ftgs.ply)
     Ftgs,
-    /// Every frame whole, for SplatRenderer of Unreal (.gsd)
+    /// Every frame in full, for SplatRenderer of Unreal (.gsd)
     Gsd,
 }

@@ -16,23 +16,23 @@ pub(in crate::cli) struct Sweep {
     pub(in crate::cli) input: Input,
     #[command(flatten)]
     pub(in crate::cli) cameras: CameraFile,
-    /// Methods to compare: `default` and `paper`, the presets; `no-refine`, the first without refining; `paper-prune`,
-    /// `paper-merge`, the paper's ablations; prunings by `visible` contribution, `projected` coverage, `opacity` or
-    /// `scale` alone, and at `random`
+    /// Methods to compare. default, paper: the presets. no-refine: default without refinement. paper-prune,
+    /// paper-merge: paper with pruning alone, with merging alone. visible, projected, opacity, scale: pruning by
+    /// visible contribution, projected coverage, opacity or scale alone. random: pruning at random
     #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
           value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
     pub(in crate::cli) methods: Vec<String>,
     /// Fractions of the Gaussians to keep, such as 0.5,20%,10x
     #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_value = "0.8,0.6,0.4,0.2,0.1", value_parser = parse_ratio)]
     pub(in crate::cli) fractions: Vec<f64>,
-    /// Run `default` also with these numbers of refinement steps, for error against run time; 0 leaves out refinement.
-    /// The steps before prune steps change in proportion
+    /// Also run `default` with these numbers of final refinement steps, for curves of error against run time; 0: no
+    /// refinement. The numbers of steps before prune steps change in proportion
     #[arg(long, value_name = "STEPS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=1_000_000))]
     pub(in crate::cli) steps: Vec<u32>,
     /// Fraction of the Gaussians to keep with --steps
     #[arg(long, value_name = "FRACTION", default_value_t = 0.1, requires = "steps")]
     pub(in crate::cli) steps_at: f64,
-    /// Number of runs per setting; the median time is given
+    /// Number of runs per setting; the reported time is their median
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
     pub(in crate::cli) repeat: u32,
     /// Maximum number of frames to compare, spread evenly
@@ -57,16 +57,18 @@ pub(in crate::cli) struct PrecisionArgs {
     pub(in crate::cli) input: Input,
     #[command(flatten)]
     pub(in crate::cli) cameras: CameraFile,
-    /// Settings to vary: views and strides of the first scoring pass (`scoring`); views and steps of pruning `rounds`;
-    /// bits of `percentiles`; f32 and f64 `sums`; radius and passes of `merging`; steps and views of `refining`;
-    /// threads and memory of the `machine` [default: all; long inputs without the last three, which take whole runs]
+    /// Settings to vary. scoring: views, and strides of pixels, views and frames, of the first scoring pass. rounds:
+    /// views of a pruning round, and fraction that it keeps. percentiles: bits of the histogram that percentiles are
+    /// read from. sums: f32 and f64 arithmetic. merging: radius, and number of passes. refining: steps, and number of
+    /// target views. machine: threads, and memory limit [default: all; for a long input without the last three, which
+    /// take complete runs]
     #[arg(long, value_name = "KNOBS", value_delimiter = ',',
           value_parser = clap::builder::PossibleValuesParser::new(Knob::ALL.map(Knob::name)))]
     pub(in crate::cli) knobs: Vec<String>,
     /// Fraction of the Gaussians that every setting keeps
     #[arg(long, value_name = "FRACTION", default_value = "0.3", value_parser = parse_ratio)]
     pub(in crate::cli) ratio: f64,
-    /// Maximum number of frames for scoring and ranking, spread evenly; whole runs use all
+    /// Maximum number of frames for scoring and ranking, spread evenly; complete runs use all
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..))]
     pub(in crate::cli) max_frames: u32,
     /// Maximum number of runs per setting, for median and range; fewer where they take more than 10 s
