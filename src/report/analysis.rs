@@ -1,14 +1,14 @@
 //! Comparison of one compressed model with the original: scores, renders and animations that the report page shows.
 
 use super::film::FilmPanel;
-use super::findings::{ResultData, WorstPlaceImages};
+use super::findings::{CompressedModelData, WorstPlaceImages};
 use super::run::RunFiles;
 use super::shown_images::ShownImage;
 
 /// Comparison of one compressed model with the original, for the report page.
 pub(super) struct Analysis {
     /// Scores, failure modes and notes of the compressed model.
-    pub(super) data: ResultData,
+    pub(super) data: CompressedModelData,
     /// Files that `compress` wrote beside the compressed model.
     pub(super) run: RunFiles,
     /// Renders that the page shows, as images.

@@ -1,14 +1,14 @@
-//! Head of the report page: the verdict, and what compression changed. The changes stand on four cards, or in one table
-//! if there are several compressed models.
+//! Head of the report page: the verdict, and what compression changed. The changes are shown on four cards, or in one
+//! table if there are several compressed models.
 
 use super::analysis::Analysis;
-use super::findings::ResultData;
+use super::findings::CompressedModelData;
 use super::html::{bytes, count, db, escape, figure, percent};
 use crate::evaluation::results::OriginalAndCompressed;
 use crate::models::ModelSize;
 
-/// Returns the HTML of the head of the page: names of the models, verdict, and changes. The changes of a single result
-/// stand on cards, those of several results in a table.
+/// Returns the HTML of the head of the page: names of the models, verdict, and changes. The changes of a single
+/// compressed model are shown on cards, those of several in a table.
 pub(super) fn header(results: &[Analysis], names: &[String]) -> String {
     let found = &results[0].data.evaluation;
     let original = escape(&found.path.original);
@@ -61,7 +61,7 @@ fn card(label: &str, before: &str, after: &str, more: &str) -> String {
 
 /// Returns the HTML of the four cards of a result. The first three are Gaussians, size and quality. The fourth is the
 /// comparison with photographs if there are any, else the render time if it was measured, else SSIM.
-fn cards(result: &ResultData) -> String {
+fn cards(result: &CompressedModelData) -> String {
     let found = &result.evaluation;
     let (counts, sizes, mean) = (found.count, found.bytes, found.loss.overall);
     let mut out = String::from("<div class=\"cards\">\n");
@@ -122,7 +122,7 @@ fn milliseconds(value: f64) -> String {
 pub(super) fn size_parts(size: &OriginalAndCompressed<ModelSize>) -> Vec<(&'static str, u64, u64)> {
     let parts = size.original.named_parts().into_iter().zip(size.compressed.named_parts());
     let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
-    // Parts below a hundredth of the whole are left out.
+    // Parts below 1% of the compressed model are left out.
     let least = size.compressed.total() / 100;
     let both: Vec<_> = parts.into_iter().filter(|&(_, before, after)| before > 0 && after > least).collect();
     if both.len() > 1 { both } else { Vec::new() }
@@ -184,7 +184,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn changes_are_told_as_factors_and_growth_as_such() {
+    fn decreases_are_factors_and_increases_are_percentages() {
         assert_eq!(times_fewer(20_880.0, 2_088.0, "fewer", "more"), "10.0× fewer (10%)");
         assert_eq!(times_fewer(10.0, 10.0, "fewer", "more"), "unchanged");
         assert_eq!(times_fewer(10.0, 12.0, "smaller", "larger"), "20% larger");

@@ -25,7 +25,7 @@ const BOTTOM: f64 = 46.0;
 const LINE: f64 = 18.0;
 /// Approximate width of a letter in SVG units (about pixels), on a narrow page, where letters are largest.
 const LETTER: f64 = 8.2;
-/// Number of different styles (color, shape, dash) of series that [`STYLE`] defines.
+/// Number of different styles of series (color, shape, dash) that [`STYLE`] defines.
 const LOOKS: usize = 9;
 
 /// Axis of a chart, as the caller describes it.
@@ -136,8 +136,8 @@ impl AxisScale {
         })
     }
 
-    /// Extends the range of values of this axis at its upper end, so that `room` pixels stay free after the largest
-    /// value.
+    /// Extends the range of values of this axis at its upper end, so that about `room` SVG units (about pixels) stay
+    /// free after the largest value.
     fn reserve_end(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
@@ -365,7 +365,7 @@ impl Drawing {
         };
         let (mut x, mut y) = (LEFT, 17.0);
         for LegendEntry { name, look, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
-            // The mark with a piece of the line.
+            // Width of the mark, or of a piece of the line with the mark.
             let sample = if *joined { 26.0 } else { 12.0 };
             let wide = name.chars().count() as f64 * LETTER + sample + 22.0;
             if x + wide > WIDTH && x > LEFT {
@@ -497,7 +497,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_left_out_and_nothing_at_all_is_said() {
+    fn charts_omit_non_finite_values_and_say_if_none_remain() {
         let svg = plot(&[(0.0, 1.0), (1.0, f64::NAN), (2.0, f64::INFINITY), (3.0, 2.0)]).svg();
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
         assert_eq!(svg.matches("<circle").count(), 1 + 2, "the legend's and one per point");
@@ -507,7 +507,7 @@ mod tests {
     }
 
     #[test]
-    fn names_cannot_become_elements() {
+    fn series_names_are_escaped() {
         assert!(!plot(&[(0.0, 1.0)]).svg().contains("<b>"));
     }
 

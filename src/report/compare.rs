@@ -52,8 +52,8 @@ struct Layer<'a> {
 }
 
 /// Returns all images that the user can select in one slider: original, compressed models, differences, and the
-/// photograph if there is one. `place` is the index of the render among those that the page shows. `names` has the
-/// names of the compressed models.
+/// photograph if there is one. `place`: index of the shown render in [`Analysis::shown`]. `names`: names of the
+/// compressed models.
 fn layers<'a>(results: &'a [Analysis], names: &[String], place: usize) -> Vec<Layer<'a>> {
     let image = |result: &'a Analysis, kind: &str| {
         let found = result.shown.get(place)?.images.iter().find(|image| image.0 == kind)?;
@@ -82,8 +82,8 @@ fn scores(shown: &ShownImage) -> String {
     format!("PSNR {}, SSIM {:.4}{flip}", db(shown.choice.psnr), shown.choice.ssim)
 }
 
-/// Returns the HTML of one slider, with the heading `title`. `place` is the index of its render among those that the
-/// page shows. The images of a slider lie on top of one another; CSS classes select the two that are visible.
+/// Returns the HTML of one slider, with the heading `title`. `place`: index of its render in [`Analysis::shown`]. The
+/// images of a slider lie on top of one another; CSS classes select the two that are visible.
 fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> String {
     let shown = &results[0].shown[place];
     let layers = layers(results, names, place);
@@ -147,7 +147,8 @@ pub(super) fn films(results: &[Analysis], names: &[String]) -> String {
          aria-label=\"Frame\"><output></output></div>\n",
         first.frames.len() - 1
     );
-    // Of every column its name, the result it belongs to, and the kind of image.
+    // Each column: its name, the index of its compressed model in `results`, and the index of its image in
+    // `IMAGE_NAMES`.
     let columns: Vec<(String, usize, usize)> = match results.len() {
         1 => IMAGE_NAMES.iter().enumerate().map(|(kind, name)| ((*name).to_owned(), 0, kind)).collect(),
         _ => std::iter::once((IMAGE_NAMES[0].to_owned(), 0, 0))

@@ -3,7 +3,7 @@
 use super::analysis::Analysis;
 use super::chart::{BarChart, ChartAxis, StackedHistogram};
 use super::document::{figure_of, heading, links, list};
-use super::findings::ResultData;
+use super::findings::CompressedModelData;
 use super::histogram::Histogram;
 use super::html::{bytes, count, db, escape, figure, percent};
 use super::run::RunFiles;
@@ -60,14 +60,14 @@ pub(super) fn details(
             "notes",
             "Notes and skipped steps",
             "Remarks of the run, and steps that this scene did not need.",
-            each(&|result, _| skipped(&result.data, &result.run)),
+            each(&|result, _| notes_section(&result.data, &result.run)),
         ),
         (
             "sweep",
             "Other sizes",
             "Quality against size, time and memory, measured by a sweep.",
-            each(&|result, _| result.run.summary.as_ref().map_or(String::new(), |(summary, _)| searched(summary)))
-                + &swept(&results[0], sweep),
+            each(&|result, _| result.run.summary.as_ref().map_or(String::new(), |(summary, _)| search_chart(summary)))
+                + &sweep_section(&results[0], sweep),
         ),
         (
             "precision",
@@ -75,7 +75,7 @@ pub(super) fn details(
             "Gain in precision from more work, for each step of the compression.",
             precision.map_or(String::new(), precision::section),
         ),
-        ("data", "Data files", "Everything on this page, for other programs.", data(results, sweep, precision)),
+        ("data", "Data files", "Everything on this page, for other programs.", data_links(results, sweep, precision)),
     ];
     sections
         .into_iter()
@@ -93,7 +93,7 @@ fn absent(text: &str) -> String {
 
 /// Returns HTML tables of all quality measures, render times and parts of the size of one compressed model. `name` is
 /// the name of the model, `result` its data.
-fn numbers(result: &ResultData, name: &str) -> String {
+fn numbers(result: &CompressedModelData, name: &str) -> String {
     let found = &result.evaluation;
     let mut out = format!(
         "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"Measures of {}\"><table class=\"wide\">\n\
@@ -210,7 +210,7 @@ fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&Stage
 
 /// Returns the histograms of the scores in `result` as charts; a score whose values all fall into one bin becomes a
 /// line of text.
-fn score_histograms(result: &ResultData) -> String {
+fn score_histograms(result: &CompressedModelData) -> String {
     let Some(histograms) = &result.histograms else {
         return absent(
             "Which Gaussians were dropped is not known: there is no index map beside the compressed model that fits.",
@@ -262,7 +262,7 @@ fn histogram(of: &Histogram) -> String {
 
 /// Returns the HTML of three lists: the omitted stages with their reasons, the percentiles of the terms of the score,
 /// and all notes.
-fn skipped(result: &ResultData, run: &RunFiles) -> String {
+fn notes_section(result: &CompressedModelData, run: &RunFiles) -> String {
     let mut out = String::new();
     if let Some((summary, _)) = &run.summary {
         let mut rows: Vec<[String; 2]> =
@@ -295,11 +295,11 @@ fn skipped(result: &ResultData, run: &RunFiles) -> String {
 
 /// Returns the chart of a search for a quality goal, with the numbers of Gaussians that the search tried. Returns an
 /// empty text if the run made no search.
-fn searched(summary: &Summary) -> String {
+fn search_chart(summary: &Summary) -> String {
     summary.goal.as_ref().map_or(String::new(), trade_off::search)
 }
 
-fn swept(first: &Analysis, sweep: Option<&TradeOff>) -> String {
+fn sweep_section(first: &Analysis, sweep: Option<&TradeOff>) -> String {
     match sweep {
         Some(found) => trade_off::section(found),
         None => absent(&format!(
@@ -310,7 +310,7 @@ fn swept(first: &Analysis, sweep: Option<&TradeOff>) -> String {
     }
 }
 
-fn data(results: &[Analysis], sweep: Option<&TradeOff>, precision: Option<&PrecisionDiagram>) -> String {
+fn data_links(results: &[Analysis], sweep: Option<&TradeOff>, precision: Option<&PrecisionDiagram>) -> String {
     let first = &results[0];
     let mut names = vec!["report.json", "pictures.csv", "failure_modes.csv"];
     names.extend(first.data.histograms.as_ref().map(|_| "histograms.csv"));

@@ -26,10 +26,11 @@ pub const MIN_PSNR_GAP_DB: f64 = 3.0;
 /// Gaussians of this kind; the share in a render is the mean over its pixels. Renders with a smaller share are ignored
 /// in the search for the worst damage to this kind. If all renders are ignored, the damage is not judged.
 pub const MIN_PIXEL_SHARE: f64 = 1e-3;
-/// Minimum lost fraction of the contribution of a kind of Gaussian to renders. The contribution of the Gaussians of
-/// this kind that were dropped or merged counts as lost. If the lost fraction is smaller, damage to this kind (its
-/// failure mode) is not flagged.
-pub const MIN_LOST_SHARE: f64 = 0.01;
+/// Minimum lost fraction of the contribution of a kind of Gaussian to renders, from 0 to 1, for its failure mode to be
+/// flagged. The lost fraction is the contribution of the Gaussians of this kind that were dropped or merged, divided by
+/// the contribution of all Gaussians of this kind. If the lost fraction is unknown (without an index map), it is not
+/// checked.
+pub const MIN_LOST_CONTRIBUTION: f64 = 0.01;
 /// Side length in pixels of the square that is shown where a failure mode is worst.
 pub const CROP_SIDE_PX: u32 = 64;
 
@@ -47,6 +48,7 @@ pub struct ViewErrorSums {
     pixels: f64,
 }
 
+/// Sums over the pixels of one view, for one kind of Gaussian (fast, thin or changing in appearance).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct FailureSums {
     /// Sum over pixels of w, the share of one kind of Gaussian in the pixel.
@@ -54,9 +56,11 @@ struct FailureSums {
     /// Sum over pixels of w e²: the share w of one kind of Gaussian in the pixel, times the squared difference e²
     /// between the renders of the two models.
     error: f64,
-    /// Sum over pixels of w ∇c·∇o. Here w is the share of one kind of Gaussian in the pixel, and c and o are the
-    /// brightness of the compressed and of the original render. The field `detail` is the sum of w ∇o·∇o.
+    /// Sum over pixels of w ∇c·∇o. Symbols: w is the share of one kind of Gaussian in the pixel; ∇c and ∇o are the
+    /// brightness gradients of the compressed and of the original render.
     kept_detail: f64,
+    /// Sum over pixels of w ∇o·∇o. Symbols: w is the share of one kind of Gaussian in the pixel; ∇o is the brightness
+    /// gradient of the original render.
     detail: f64,
 }
 
@@ -70,7 +74,7 @@ pub enum Verdict {
     /// is below [`MIN_PIXEL_SHARE`].
     Unseen,
     /// Verdict if compression dropped or merged almost no Gaussian of the kind that the failure mode concerns: less
-    /// than the fraction [`MIN_LOST_SHARE`] of the contribution of this kind to renders.
+    /// than the fraction [`MIN_LOST_CONTRIBUTION`] of the contribution of this kind to renders.
     Untouched,
     /// Verdict if damage to this failure mode's kind of Gaussian is not visible. Where this kind is visible, PSNR is at
     /// least [`VISIBLE_ERROR_PSNR_DB`], or it is lower than elsewhere by less than [`MIN_PSNR_GAP_DB`].
@@ -114,22 +118,24 @@ pub struct FailureMode {
     pub merged: Option<usize>,
     /// Contribution of the Gaussians of this kind to renders, as a fraction of the contribution of all Gaussians.
     pub coverage: f64,
-    /// Fraction of this kind's contribution to renders that belongs to Gaussians that were dropped or merged; `None`
-    /// without an index map (file that maps input to output Gaussians).
+    /// Fraction of this kind's contribution to renders that is lost: the part of the Gaussians that were dropped or
+    /// merged. `None` without an index map (file that maps input to output Gaussians).
     pub coverage_lost: Option<f64>,
-    /// Mean share of this kind of Gaussian in a pixel (Σ alpha · transmittance of its Gaussians), over all pixels of
-    /// all compared renders, from 0 to 1.
+    /// Mean share of this kind of Gaussian in a pixel, from 0 to 1, over all pixels of all compared renders. The share
+    /// in a pixel is Σ alpha · transmittance of the Gaussians of this kind.
     #[serde(rename = "shown")]
     pub pixel_share: f64,
-    /// PSNR where this kind of Gaussian is visible, with each pixel weighted by the share of the kind, dB; `None` if
-    /// the kind is nowhere visible.
+    /// PSNR where this kind of Gaussian is visible, dB. The weight of a pixel is the share of this kind in the pixel.
+    /// `None` if all weights are 0.
     #[serde(rename = "psnr_there")]
     pub psnr_on_kind: Option<f64>,
-    /// PSNR where other kinds of Gaussian are visible, dB. Each pixel is weighted by the share that does not belong to
-    /// the kind of this failure mode. `None` if no pixel has such a share.
+    /// PSNR where this kind of Gaussian is not visible, dB. The weight of a pixel is 1 minus the share of this kind in
+    /// the pixel. `None` if all weights are 0.
     pub psnr_elsewhere: Option<f64>,
-    /// Lost fraction of the original's brightness gradients where this kind of Gaussian is visible; negative if the
-    /// compressed model exaggerates the gradients. `None` if the original has no gradients there.
+    /// Lost fraction of the original's brightness gradients where this kind of Gaussian is visible: 1 − Σ w ∇c·∇o / Σ w
+    /// ∇o·∇o over all pixels. Symbols: w is the share of this kind in the pixel; ∇o and ∇c are the brightness gradients
+    /// of the original and of the compressed render. Negative if the compressed model exaggerates the gradients. `None`
+    /// if the original has no gradients there.
     pub detail_lost: Option<f64>,
     /// Render in which the damage to this kind of Gaussian is worst; `None` if the damage cannot be judged in any
     /// render.
@@ -154,12 +160,12 @@ pub struct KindTotals {
 /// Renders an image that shows where each kind of Gaussian is visible. Red, green and blue of a pixel are the shares (Σ
 /// alpha · transmittance) of the three kinds in [`GaussianKind::ALL`]: fast, thin, changing in appearance.
 /// - `state`: all Gaussians of the original at one frame
-/// - `traits`: for each Gaussian, the kinds to which it belongs
-pub fn render_kind_shares(state: &Gaussians, traits: &[KindFlags], camera: &Camera) -> Image {
+/// - `kinds`: for each Gaussian, whether it belongs to each kind
+pub fn render_kind_shares(state: &Gaussians, kinds: &[KindFlags], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
-    for (i, traits) in traits.iter().enumerate() {
+    for (i, kinds) in kinds.iter().enumerate() {
         // Color is 0.5 + SH_C0 · coefficient.
-        sh.set_row(i, traits.map(|of| ((f64::from(u8::from(of)) - 0.5) / SH_C0) as f32));
+        sh.set_row(i, kinds.map(|of| ((f64::from(u8::from(of)) - 0.5) / SH_C0) as f32));
     }
     let marked = Gaussians {
         position: state.position.clone(),
@@ -174,13 +180,13 @@ pub fn render_kind_shares(state: &Gaussians, traits: &[KindFlags], camera: &Came
 /// Returns the squared error between the renders of both models in one view, summed over its pixels: in total, and for
 /// each kind of Gaussian (fast, thin or changing in appearance).
 /// - `state`: Gaussians of the original at the frame of the view
-/// - `traits`: for each Gaussian, the kinds to which it belongs
+/// - `kinds`: for each Gaussian, whether it belongs to each kind
 /// - `taken`: renders of both models
 ///
 /// # Panics
 /// Panics if the sizes of the two renders and of the camera's images differ.
-pub fn sum_errors(state: &Gaussians, traits: &[KindFlags], camera: &Camera, taken: &RenderedViews) -> ViewErrorSums {
-    let shares = render_kind_shares(state, traits, camera);
+pub fn sum_errors(state: &Gaussians, kinds: &[KindFlags], camera: &Camera, taken: &RenderedViews) -> ViewErrorSums {
+    let shares = render_kind_shares(state, kinds, camera);
     let (original, compressed) = (brightness(&taken.original), brightness(&taken.compressed));
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut found = ViewErrorSums { pixels: (width * height) as f64, ..ViewErrorSums::default() };
@@ -218,16 +224,17 @@ fn brightness(image: &Image) -> Vec<f64> {
 }
 
 /// Measures the errors of renders where Gaussians of the kind `kind` are visible. Returns the measurements and a
-/// [`Verdict`], which states whether these errors are perceptible and much larger than elsewhere. `members` has the
-/// counts and the contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the
-/// frame and the view of each render.
+/// [`Verdict`], which states whether these errors are visible and much larger than elsewhere.
+/// - `members`: counts and contribution of the Gaussians of this kind
+/// - `seen`: error sums of all renders
+/// - `names`: frame and view of each render
 pub fn assess_failure_mode(
     kind: GaussianKind,
     members: KindTotals,
     seen: &[ViewErrorSums],
     names: &[(usize, u32)],
 ) -> FailureMode {
-    let (name, happens_to) = described(kind);
+    let (name, happens_to) = name_and_description(kind);
     let at = kind as usize;
     let sum = |value: fn(&FailureSums) -> f64| seen.iter().map(|of| value(&of.kinds[at])).sum::<f64>();
     let (weight, error) = (sum(|s| s.weight), sum(|s| s.error));
@@ -250,7 +257,7 @@ pub fn assess_failure_mode(
         Verdict::Absent
     } else if worst.is_none() {
         Verdict::Unseen
-    } else if lost.is_some_and(|lost| lost < MIN_LOST_SHARE) {
+    } else if lost.is_some_and(|lost| lost < MIN_LOST_CONTRIBUTION) {
         Verdict::Untouched
     } else if apart {
         Verdict::Flagged
@@ -276,7 +283,7 @@ pub fn assess_failure_mode(
 
 /// Returns two texts for a kind of Gaussian: the name of its failure mode, and a description of the Gaussians of this
 /// kind.
-fn described(kind: GaussianKind) -> (&'static str, String) {
+fn name_and_description(kind: GaussianKind) -> (&'static str, String) {
     use super::gaussian_kinds::{
         MAX_STILL_MOTION, MIN_COLOR_CHANGE, MIN_FAST_MOTION, MIN_NON_RIGID_CHANGE, MIN_OPACITY_CHANGE, MIN_THIN_RATIO,
         NEIGHBORS,
@@ -305,18 +312,20 @@ fn described(kind: GaussianKind) -> (&'static str, String) {
     }
 }
 
-/// Returns the PSNR in dB, at most [`PSNR_CAP_DB`]. `error` is a weighted sum of squared errors, and `weight` the sum
-/// of the weights; `None` if the weights sum to 0.
+/// Returns the PSNR −10 log10(`error` / `weight`) in dB, but at most [`PSNR_CAP_DB`]. `error`: weighted sum of squared
+/// errors. `weight`: sum of the weights; if it is 0, the result is `None`.
 fn db(error: f64, weight: f64) -> Option<f64> {
     (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
 }
 
-/// Returns the upper left corner of the square of a render in which the error of one kind of Gaussian is largest.
-/// `taken` has the renders of both models, and `shares` the shares w of the kinds in every pixel.
+/// Returns the upper left corner (column, row) of the square of a render in which the error of the kind `kind` of
+/// Gaussian is largest.
+/// - `taken`: renders of both models
+/// - `shares`: share of each kind of Gaussian in every pixel, from [`render_kind_shares`]
 ///
-/// - The error of a square is the sum of w e² over its pixels, where e² is the squared difference of the renders.
-/// - A square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render.
-/// - Of equal squares, the first is taken, row by row.
+/// The error of a square is the sum of w e² over its pixels, where w is the share of the kind and e² the squared
+/// difference of the renders. A square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal
+/// squares, the first is taken, row by row.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP_SIDE_PX as usize).min(width), (CROP_SIDE_PX as usize).min(height));

@@ -1,6 +1,6 @@
 //! Section of the report page about the failure modes (damage to kinds of Gaussians that compression is known to hurt).
 
-use super::failure::{FailureMode, MIN_LOST_SHARE, MIN_PSNR_GAP_DB, VISIBLE_ERROR_PSNR_DB, Verdict};
+use super::failure::{FailureMode, MIN_LOST_CONTRIBUTION, MIN_PSNR_GAP_DB, VISIBLE_ERROR_PSNR_DB, Verdict};
 use super::findings::WorstPlaceImages;
 use super::html::{count, db, escape, figure, percent};
 
@@ -11,7 +11,7 @@ pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String
         "<p class=\"note\">Each pixel knows the share of its color that comes from a kind of Gaussian. A mode is flagged if \
          the PSNR where the kind is visible is below {VISIBLE_ERROR_PSNR_DB} dB and at least {MIN_PSNR_GAP_DB} dB below the PSNR elsewhere, \
          and {}% or more of the kind’s coverage was dropped or merged.</p>\n<div class=\"modes\">\n",
-        figure(100.0 * MIN_LOST_SHARE)
+        figure(100.0 * MIN_LOST_CONTRIBUTION)
     );
     for (number, mode) in modes.iter().enumerate() {
         let (class, word) = match mode.verdict {

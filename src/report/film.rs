@@ -55,8 +55,8 @@ pub struct FilmPanel {
     /// smaller.
     #[serde(skip)]
     pub size: (u32, u32),
-    /// Number of render pixels along each axis that one pixel of the images of the original and the compressed model
-    /// stands for.
+    /// Factor by which renders of the original and of the compressed model are scaled down along each axis: one pixel
+    /// of the image stands for `shrunk` × `shrunk` pixels of the render.
     #[serde(skip)]
     pub shrunk: u32,
     /// Factor by which the difference images are brightened.
@@ -67,8 +67,8 @@ pub struct FilmPanel {
 /// Names of the three images of each frame, in the order of [`FilmPanel::images`].
 pub const IMAGE_NAMES: [&str; 3] = ["original", "compressed", "difference"];
 
-/// Returns the estimated bytes of memory for the animations and for the page that contains them, in total: one byte per
-/// pixel for each of the two.
+/// Returns the estimated bytes of memory of the animations: 1 byte per pixel of their images, and 1 byte per pixel in
+/// the page that contains them.
 pub fn memory_bytes(work: &Workload) -> u64 {
     let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)

@@ -19,7 +19,7 @@ pub struct ReportData {
     pub tool: String,
     /// Data of the first compressed model.
     #[serde(flatten)]
-    pub result: ResultData,
+    pub result: CompressedModelData,
     /// Renders that the page shows, with the reasons for their choice.
     pub shown: Vec<ChosenRender>,
     /// Animations that the page shows.
@@ -31,12 +31,12 @@ pub struct ReportData {
     pub precision: Option<PrecisionDiagram>,
     /// Data of the further compressed models, in the order of the command line.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub others: Vec<ResultData>,
+    pub others: Vec<CompressedModelData>,
 }
 
 /// Data of one compressed model in a report.
 #[derive(Debug, Serialize)]
-pub struct ResultData {
+pub struct CompressedModelData {
     /// Verdict in two or three sentences: size of the model, how visible its differences from the original are, and
     /// failure modes.
     pub verdict: String,
@@ -69,7 +69,7 @@ pub struct ResultData {
 /// Images of the place where a failure mode is worst: the same square of a render of both models.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct WorstPlaceImages {
-    /// Index of the failure mode in [`ResultData::failure_modes`].
+    /// Index of the failure mode in [`CompressedModelData::failure_modes`].
     pub(super) mode: usize,
     /// Column and row, in the full render, of the upper left pixel of the square where the failure mode is worst.
     pub(super) corner: (u32, u32),

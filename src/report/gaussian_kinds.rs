@@ -25,8 +25,8 @@ pub const MIN_FAST_MOTION: f64 = 2e-3;
 /// - For a Gaussian, it is the lower median of the values for its neighbors.
 pub const MIN_NON_RIGID_CHANGE: f64 = 0.05;
 /// Minimum divisor, as a fraction of the scene extent, in the relative change of the distance between two neighbors.
-/// The change is divided by the distance or by this minimum, whichever is larger. Without the minimum, invisible small
-/// motions of very close neighbors would give large relative changes.
+/// The relative change is the change of the distance, divided by max(distance, minimum). Without the minimum, small
+/// invisible motions of very close neighbors would give large relative changes.
 const NEAREST: f64 = 1e-3;
 /// Number of nearest neighbors of a Gaussian to which distances are measured over time.
 pub const NEIGHBORS: usize = 8;
@@ -42,8 +42,8 @@ pub const MIN_OPACITY_CHANGE: f64 = 0.05;
 /// the Gaussian is alive (opacity ≥ alpha_min), root mean square over the channels, colors in [0, 1]. It is five steps
 /// of 1/255.
 pub const MIN_COLOR_CHANGE: f64 = 0.02;
-/// Maximum number of frames at which distances to neighbors, and colors, of Gaussians are measured. The frames are
-/// evenly spaced.
+/// Maximum number of frames at which the colors of Gaussians and the distances to their neighbors are measured. The
+/// frames are evenly spaced.
 pub const MAX_SAMPLED_FRAMES: usize = 24;
 
 /// Kind of Gaussian that compression is known to damage.
@@ -82,8 +82,8 @@ pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
 pub type KindFlags = [bool; 3];
 
 /// Returns for every Gaussian the [`GaussianKind`]s to which it belongs, as one flag per kind. A Gaussian that is never
-/// visible belongs to none. `scored` has the statistics of the Gaussians. A Gaussian counts as alive at opacities of at
-/// least `alpha_min`.
+/// visible belongs to none. `scored` has the statistics of the Gaussians. The change of a Gaussian's color is measured
+/// over the frames at which it is alive: its opacity is at least `alpha_min`.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -120,17 +120,18 @@ pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> 
 /// - the contribution of the Gaussians of this kind for which `is_lost` is true, divided by the contribution of the
 ///   kind
 ///
-/// `traits` states for every Gaussian to which kinds it belongs. The argument of `is_lost` is the index of a Gaussian.
+/// `kinds` states for every Gaussian whether it belongs to each kind. The argument of `is_lost` is the index of a
+/// Gaussian.
 pub fn contribution_shares(
     rows: &StatisticRows,
-    traits: &[KindFlags],
+    kinds: &[KindFlags],
     is_lost: impl Fn(usize) -> bool,
 ) -> [(f64, f64); 3] {
     // `sum` of nothing is −0, which would be displayed.
     let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
     std::array::from_fn(|kind| {
         let of = |wanted: &dyn Fn(usize) -> bool| -> f64 {
-            (0..rows.len()).filter(|&i| traits[i][kind] && wanted(i)).fold(0.0, |sum, i| sum + rows.c[i])
+            (0..rows.len()).filter(|&i| kinds[i][kind] && wanted(i)).fold(0.0, |sum, i| sum + rows.c[i])
         };
         let own = of(&|_| true);
         let part = |of: f64, whole: f64| if whole > 0.0 { of / whole } else { 0.0 };
@@ -154,9 +155,9 @@ fn samples(frames: usize) -> Vec<usize> {
 ///
 /// - The neighbors are the nearest visible Gaussians at the reference frame.
 /// - For each neighbor, the root mean square change of its distance over the frames `frames` is divided by the distance
-///   at the reference frame or by `nearest`, whichever is larger.
-/// - The result is the lower median of these relative changes over the neighbors. So neighbors that belong to another
-///   object have no effect if they are few.
+///   at the reference frame or by `nearest` (scene units), whichever is larger.
+/// - The result is the lower median of these relative changes over the neighbors. So a few neighbors that belong to
+///   another object have no effect.
 fn non_rigid_motion(
     source: &dyn FrameSource,
     reference: &Gaussians,
@@ -212,9 +213,9 @@ fn non_rigid_motion(
         .collect())
 }
 
-/// Returns the standard deviation of the base color of each of the Gaussians `all` (ids), root mean square over the
-/// channels. It is taken over those of the frames `frames` in which the Gaussian is alive (opacity at least
-/// `alpha_min`). Returns an empty list if colors do not vary.
+/// Returns how much the base color of each of the Gaussians `all` (ids) changes over time: its standard deviation, root
+/// mean square over the channels, with colors in [0, 1]. Of the frames `frames`, only those at which the Gaussian is
+/// alive (opacity at least `alpha_min`) count. Returns an empty list if colors do not vary.
 fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Attributes::SH) {
         return Ok(Vec::new());
@@ -297,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn rigid_motion_bends_nothing_and_stretching_bends_by_its_part() {
+    fn rigid_motion_gives_0_and_stretching_its_relative_change() {
         let turned = bent(|[x, y, z], t| {
             let (sin, cos) = (3.0 * t).sin_cos();
             [x * cos - y * sin + 40.0 * t, x * sin + y * cos, z - 7.0 * t]
@@ -310,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn colors_count_while_a_gaussian_lives() {
+    fn color_changes_count_only_while_a_gaussian_is_alive() {
         // 0 flashes, 1 is constant, 2 flashes only while dead.
         let source = Made(info(3, 8), |id, frame, out: &mut Gaussians, row| {
             let flash = frame % 2 == 1;

@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn one_value_has_one_bin_and_none_has_none() {
+    fn one_value_has_one_bin_and_no_value_has_no_bin() {
         let found = Histogram::from_values("V", "", &[2.0, 2.0, f64::NAN], &[Fate::Kept; 3]);
         assert_eq!((found.bins.kept.clone(), found.zero.kept), (vec![2], 1));
         assert!(found.edges[0] < 2.0 && found.edges[1] > 2.0);
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn shares_of_the_frames_are_counted_from_0_to_1() {
+    fn fractions_of_frames_have_bins_from_0_to_1() {
         // 4 of 10 frames, 7 of 10, and twice all of them.
         let found = Histogram::within("life", "", even(10), &[0.4, 0.7, 1.0, 1.0, 0.0], &[Fate::Kept; 5]);
         assert_eq!((found.edges[0], found.edges[10], found.log), (0.0, 1.0, false));

@@ -72,7 +72,8 @@ pub(super) fn bytes(value: u64) -> String {
     }
 }
 
-/// Formats `part` as a percentage of `whole`; 100% if `whole` is 0. A percentage below 0.1% is not rounded to 0.
+/// Formats `part` as a percentage of `whole`; 100% if `whole` is 0. Percentages above 0 and below 0.1% become "under
+/// 0.1%".
 pub(super) fn percent(part: f64, whole: f64) -> String {
     let share = if whole > 0.0 { 100.0 * part / whole } else { 100.0 };
     match share {
@@ -87,14 +88,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_text_can_leave_its_place() {
+    fn html_special_characters_are_escaped() {
         let escaped = escape("<script>alert(\"x\")</script> & 'y'");
         assert!(!escaped.contains(['<', '>', '"', '\'']), "{escaped}");
         assert_eq!(escape("a&b"), "a&amp;b");
     }
 
     #[test]
-    fn figures_are_short() {
+    fn formatted_numbers_are_short() {
         let cases = [
             (0.0, "0"),
             (48.912, "48.91"),

@@ -54,7 +54,7 @@ use crate::pipeline::stages::measure::MeasureStages;
 use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
-pub use findings::{ReportData, ResultData};
+pub use findings::{CompressedModelData, ReportData};
 
 use analysis::Analysis;
 use failure::{FailureMode, KindTotals, assess_failure_mode, sum_errors};
@@ -112,8 +112,8 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
             "several results: expected an original that can be read again, found standard input (-)",
         ));
     }
-    let trade_off = options.sweep.as_deref().map(|path| read_found(path, "sweep")).transpose()?;
-    let precision = options.precision.as_deref().map(|path| read_found(path, "precision")).transpose()?;
+    let trade_off = options.sweep.as_deref().map(|path| read_result(path, "sweep")).transpose()?;
+    let precision = options.precision.as_deref().map(|path| read_result(path, "precision")).transpose()?;
     let mut results = vec![analyze(&options.evaluate, None, options.render_time)?];
     for path in &options.more {
         let evaluate = EvaluateOptions { compressed: path.clone(), ..options.evaluate.clone() };
@@ -158,20 +158,21 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         }));
         needs
     })?;
-    let in_parts = side.scene.work.is_enabled();
-    let compared = if in_parts { Some(side.evaluate_as_first_stage()?) } else { None };
+    let has_cache = side.scene.work.is_enabled();
+    let compared = if has_cache { Some(side.evaluate_as_first_stage()?) } else { None };
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
-    if in_parts {
-        // The comparison above has the key of `evaluate`; the keys of later stages also depend on the recipe.
+    if has_cache {
+        // The comparison above has the cache key of the command `evaluate`, so both commands share its result. The keys
+        // of later stages also depend on the views that score Gaussians, and on the recipe.
         side.scene.work.depend_on(CacheKey::new(&(&side.scene.schedule, &recipe)));
     }
     let scored = measure.measure(&side.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));
-    let find_traits = || kind_flags(side.scene.source(), &scored, recipe.scan.alpha_min);
-    let traits = side.scene.work.get_or_compute("traits", side.scene.work.key(&()), find_traits)?;
+    let find_kinds = || kind_flags(side.scene.source(), &scored, recipe.scan.alpha_min);
+    let kinds = side.scene.work.get_or_compute("traits", side.scene.work.key(&()), find_kinds)?;
     let rows = scored.rows()?;
-    let members = members(&rows, &traits, run.fates.as_deref());
-    let look = |state: &Gaussians, camera: &Camera, taken: &RenderedViews| sum_errors(state, &traits, camera, taken);
+    let members = kind_totals(&rows, &kinds, run.fates.as_deref());
+    let look = |state: &Gaussians, camera: &Camera, taken: &RenderedViews| sum_errors(state, &kinds, camera, taken);
     let (evaluation, seen) = match compared {
         None => side.observe(look)?,
         Some(compared) => (compared, side.observe_sharded("failure", look)?),
@@ -184,7 +185,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         .map(|(&kind, members)| assess_failure_mode(kind, members, &seen, &names))
         .collect();
     let choices = wanted.map_or_else(|| choose_renders(&evaluation), |wanted| with_scores_from(&evaluation, wanted));
-    let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
+    let (shown, close) = show_again(&side, &choices, &failure_modes, &kinds)?;
     let films = film::render_films(&side, &shown)?;
     let render_time = if render_time { side.render_time()? } else { None };
 
@@ -194,7 +195,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         Some(fates) => Some(histograms(&rows, &scored.scores(&recipe.score)?, frames, fates)),
         None => None,
     };
-    let data = ResultData {
+    let data = CompressedModelData {
         verdict: verdict::verdict(&evaluation, &failure_modes),
         pictures: evaluation.views.clone(),
         evaluation: evaluation.with_file_names_only(),
@@ -209,13 +210,13 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     Ok(Analysis { data, run, shown, films, close })
 }
 
-/// Maximum size in bytes of a JSON file of `sweep` or `precision` that is read. A file about a thousand runs has less
-/// than one million bytes.
-const MAX_FOUND: u64 = 16 << 20;
+/// Maximum size in bytes of a JSON file of `sweep` or `precision`; a larger file is not read. A file about a thousand
+/// runs has less than one million bytes.
+const MAX_JSON_BYTES: u64 = 16 << 20;
 
 /// Reads the JSON file at `path`, which the command `command` (`sweep` or `precision`) wrote.
-fn read_found<T: DeserializeOwned>(path: &Path, command: &str) -> Result<T> {
-    let text = read_text(path, MAX_FOUND)?;
+fn read_result<T: DeserializeOwned>(path: &Path, command: &str) -> Result<T> {
+    let text = read_text(path, MAX_JSON_BYTES)?;
     serde_json::from_str(&text).map_err(|error| {
         let expected = format!("the data of `splatsieve {command}`");
         Error::input(path, format!("line {}", error.line()), expected, error.to_string())
@@ -297,16 +298,16 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
 ///
 /// Arguments, each with one entry per Gaussian:
 /// - `rows`: statistics.
-/// - `traits`: for each kind, whether the Gaussian is of this kind.
+/// - `kinds`: for each kind, whether the Gaussian is of this kind.
 /// - `fates`: whether the Gaussian was kept, merged or dropped. `None` if there is no index map (file that maps input
 ///   to output Gaussians).
-fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindTotals; 3] {
+fn kind_totals(rows: &StatisticRows, kinds: &[KindFlags], fates: Option<&[Fate]>) -> [KindTotals; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
-    let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
+    let shares = contribution_shares(rows, kinds, |i| fate(i) != Fate::Kept);
     std::array::from_fn(|kind| {
-        let with = |wanted: Fate| (0..traits.len()).filter(|&i| traits[i][kind] && fate(i) == wanted).count();
+        let with = |wanted: Fate| (0..kinds.len()).filter(|&i| kinds[i][kind] && fate(i) == wanted).count();
         KindTotals {
-            count: traits.iter().filter(|of| of[kind]).count(),
+            count: kinds.iter().filter(|of| of[kind]).count(),
             fates: fates.map(|_| (with(Fate::Dropped), with(Fate::Merged))),
             shares: shares[kind],
         }
@@ -318,12 +319,12 @@ fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -
 /// - the images of each element of `choices`
 /// - for each failure mode that has such a view, the images of a square around the worst damage
 ///
-/// `traits` states for every Gaussian to which kinds (fast, thin, changing in appearance) it belongs.
+/// `kinds` states for every Gaussian whether it belongs to each kind (fast, thin, changing in appearance).
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],
     modes: &[FailureMode],
-    traits: &[KindFlags],
+    kinds: &[KindFlags],
 ) -> Result<(Vec<ShownImage>, Vec<WorstPlaceImages>)> {
     let worst = || modes.iter().enumerate().filter_map(|(mode, of)| Some((mode, of.worst?.place)));
     let places: Vec<usize> = choices.iter().map(|choice| choice.place).chain(worst().map(|(_, place)| place)).collect();
@@ -333,7 +334,7 @@ fn show_again(
             shown.push(create_images(choice, &taken)?);
         }
         for (mode, _) in worst().filter(|&(_, at)| at == place) {
-            let shares = failure::render_kind_shares(state, traits, camera);
+            let shares = failure::render_kind_shares(state, kinds, camera);
             let corner = failure::worst_corner(&taken, &shares, GaussianKind::ALL[mode]);
             let part = |image| shown_images::data_uri(&failure::crop_square(image, corner));
             let images = [part(&taken.original)?, part(&taken.compressed)?];
@@ -342,7 +343,7 @@ fn show_again(
         Ok(())
     })?;
     made.into_iter().collect::<Result<()>>()?;
-    // In the order of the choices: renders come back by frame.
+    // Renders come back sorted by frame; the page shows them in the order of the choices.
     shown.sort_by_key(|shown| choices.iter().position(|choice| choice.place == shown.choice.place));
     Ok((shown, close))
 }

@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_exact_has_a_table_and_no_diagram() {
+    fn errors_of_0_have_a_table_and_no_diagram() {
         let knob = knob(vec![mark(1.0, &[("bytes", 0.0)])]);
         assert!(charts(&knob).is_empty());
         let section = knob_html(&knob);

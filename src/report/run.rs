@@ -95,7 +95,7 @@ fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fat
         return Err("expected a NumPy array, found a header that no array of numbers has".to_owned());
     }
     let array = npyz::NpyFile::new(file).map_err(|e| e.to_string())?;
-    // The shape is checked before memory is allocated for it.
+    // The shape is checked before memory for the array is allocated.
     if array.shape() != [original as u64] {
         return Err(format!("expected an array of the original's {original} Gaussians, found {:?}", array.shape()));
     }
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_absent_or_of_another_scene_is_named_and_no_failure() {
+    fn missing_or_foreign_files_are_named_without_failure() {
         let folder = tempfile::tempdir().unwrap();
         let run = RunFiles::read_files_beside(folder.path(), 4, 2);
         assert!(run.summary.is_none() && run.recipe.is_none() && run.fates.is_none());

@@ -110,11 +110,12 @@ pub fn with_scores_from(found: &Evaluation, choices: &[ChosenRender]) -> Vec<Cho
 pub struct ShownImage {
     /// Chosen render, with its scores.
     pub choice: ChosenRender,
-    /// Names and data URIs of the images: original, compressed, difference and, if there is one, photograph.
+    /// Names and data URIs of the images: original, compressed model, difference and, if there is one, photograph.
     pub images: Vec<(&'static str, String)>,
     /// Width and height of the shown images, pixels.
     pub size: (u32, u32),
-    /// Number of render pixels along each axis that one shown pixel stands for.
+    /// Factor by which the render is scaled down along each axis: one pixel of the shown image stands for `shrunk` ×
+    /// `shrunk` pixels of the render.
     pub shrunk: u32,
     /// Factor by which the difference image is brightened.
     pub factor: u32,

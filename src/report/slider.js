@@ -36,7 +36,7 @@ for (const root of document.querySelectorAll(".slider")) {
   range.addEventListener("input", () => cut(range.valueAsNumber));
   sides.forEach((side) => side.addEventListener("change", () => choose(side)));
 
-  // A browser that goes back restores what was chosen.
+  // When a user goes back to this page, the browser restores the former choices and position: apply them.
   sides.forEach(choose);
   cut(range.valueAsNumber);
 }

@@ -178,7 +178,7 @@ fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
         if pair.iter().all(|&name| curves.iter().any(|curve| curve.name == name)) {
             let place =
                 |curve: &MethodCurve<'_>| pair.iter().position(|&name| name == curve.name).unwrap_or(pair.len());
-            // The sort is stable, so the others stay in their order.
+            // The sort is stable, so all other curves stay in their order.
             curves.sort_by_key(place);
             curves[1].paired = true;
         }
@@ -235,7 +235,7 @@ mod tests {
             point("random", 20, 15.0, Some(3 << 20)),
         ];
         let charts = charts(&found(points, Vec::new()));
-        // Two of every chart are the legend's.
+        // Two marks of every chart belong to the legend.
         assert_eq!(charts.iter().map(|chart| marks(&chart.1) - 2).collect::<Vec<_>>(), [3, 3, 3, 3, 3, 3, 2]);
         assert!(charts.iter().all(|chart| chart.1.contains(">random</text>")));
         assert_eq!(charts[0].1.matches("<polyline").count(), 1, "a single point has no line");
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn a_knob_is_drawn_with_its_values_beside_what_it_starts_from() {
+    fn effort_chart_shows_values_and_the_unrefined_method() {
         let setting = |(value, psnr): (u32, f64)| EffortSetting { value, point: point("default", 10, psnr, None) };
         let settings = [(100, 20.0), (1500, 40.0)].map(setting).to_vec();
         let knob = EffortCurve { parameter: "refine_steps".to_owned(), settings };

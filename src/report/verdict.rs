@@ -5,8 +5,8 @@ use super::html::percent;
 use crate::evaluation::results::Evaluation;
 use crate::metrics::PSNR_CAP_DB;
 
-/// Words for the quality in the verdict, each with the mean PSNR in dB from which on it is used. The root mean square
-/// error is below 1/255 from 50 dB on, below 3/255 at 40 dB, 8/255 at 30 dB and 16/255 at 24 dB.
+/// Words of the verdict for the quality, each with the lowest mean PSNR in dB at which they are used. The root mean
+/// square error is below 1/255 from 50 dB on, below 3/255 at 40 dB, 8/255 at 30 dB and 16/255 at 24 dB.
 const WORDS: [(f64, &str); 6] = [
     (PSNR_CAP_DB, "renders exactly as the original does"),
     (50.0, "differs from the original by less than a screen can show"),

@@ -16,14 +16,14 @@ use crate::report::gaussian_kinds::{contribution_shares, kind_flags};
 use crate::source::FrameSource;
 
 /// Test scene with its scores and the kinds of its Gaussians.
-struct Looked {
+struct ScoredScene {
     made: DemoScene,
     scored: Scored,
-    traits: Vec<KindFlags>,
+    kinds: Vec<KindFlags>,
     _folder: tempfile::TempDir,
 }
 
-fn looked() -> Looked {
+fn scored_scene() -> ScoredScene {
     let folder = tempfile::tempdir().unwrap();
     let made = DemoScene::new(3000, 12);
     let path = folder.path().join("scene.gseq");
@@ -33,23 +33,23 @@ fn looked() -> Looked {
     let scene = crate::scene::Scene::new(path, input, rig, Some(Split::Train)).unwrap();
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
-    let traits = kind_flags(scene.source(), &scored, recipe.scan.alpha_min).unwrap();
-    Looked { made, scored, traits, _folder: folder }
+    let kinds = kind_flags(scene.source(), &scored, recipe.scan.alpha_min).unwrap();
+    ScoredScene { made, scored, kinds, _folder: folder }
 }
 
-impl Looked {
-    /// Returns the fraction of the visible Gaussians of the object `body` (of the test scene) that belong to `kind`.
+impl ScoredScene {
+    /// Returns the fraction of the visible Gaussians of the object `body` of the test scene that belong to `kind`.
     fn part(&self, body: DemoBody, kind: GaussianKind) -> f64 {
         let rows = self.scored.rows().unwrap();
         let members: Vec<usize> = self.made.body_ids(body).filter(|&i| rows.c[i] > 0.0).collect();
-        let with = members.iter().filter(|&&i| self.traits[i][kind as usize]).count();
+        let with = members.iter().filter(|&&i| self.kinds[i][kind as usize]).count();
         with as f64 / members.len().max(1) as f64
     }
 
     /// Returns the failure modes of a compressed model that lacks the Gaussians for which `lost` is true.
     fn without(&self, lost: impl Fn(usize) -> bool) -> [FailureMode; 3] {
         let rig = self.made.rig();
-        let all: Vec<u32> = (0..self.traits.len() as u32).collect();
+        let all: Vec<u32> = (0..self.kinds.len() as u32).collect();
         let left: Vec<u32> = all.iter().copied().filter(|&i| !lost(i as usize)).collect();
         let (mut seen, mut names) = (Vec::new(), Vec::new());
         for frame in (0..self.made.info().times.len()).step_by(3) {
@@ -61,14 +61,14 @@ impl Looked {
                     compressed: render(&state.pick(&left), camera, [0.0; 3]),
                     truth: None,
                 };
-                seen.push(sum_errors(&state, &self.traits, camera, &taken));
+                seen.push(sum_errors(&state, &self.kinds, camera, &taken));
                 names.push((frame, view as u32));
             }
         }
-        let shares = contribution_shares(&self.scored.rows().unwrap(), &self.traits, &lost);
+        let shares = contribution_shares(&self.scored.rows().unwrap(), &self.kinds, &lost);
         GaussianKind::ALL.map(|kind| {
             let of = |wanted: bool| {
-                (0..self.traits.len()).filter(|&i| self.traits[i][kind as usize] && (!wanted || lost(i))).count()
+                (0..self.kinds.len()).filter(|&i| self.kinds[i][kind as usize] && (!wanted || lost(i))).count()
             };
             let members = KindTotals { count: of(false), fates: Some((of(true), 0)), shares: shares[kind as usize] };
             assess_failure_mode(kind, members, &seen, &names)
@@ -78,7 +78,7 @@ impl Looked {
 
 #[test]
 fn kinds_are_found_where_the_scene_has_them_and_nowhere_else() {
-    let scene = looked();
+    let scene = scored_scene();
     assert!(
         scene.part(DemoBody::Cloth, GaussianKind::Motion) > 0.3,
         "got {}",
@@ -97,14 +97,14 @@ fn kinds_are_found_where_the_scene_has_them_and_nowhere_else() {
         }
     }
     let buried = scene.made.body_ids(DemoBody::Buried);
-    assert!(scene.traits[buried].iter().all(|of| *of == [false; 3]), "what is never seen is of no kind");
+    assert!(scene.kinds[buried].iter().all(|of| *of == [false; 3]), "what is never seen is of no kind");
 }
 
 #[test]
 fn each_failure_mode_is_flagged_only_where_its_kind_is_lost() {
-    let scene = looked();
+    let scene = scored_scene();
     for (number, kind) in GaussianKind::ALL.into_iter().enumerate() {
-        let found = scene.without(|i| scene.traits[i][number]);
+        let found = scene.without(|i| scene.kinds[i][number]);
         let at = &found[number];
         assert_eq!(at.verdict, Verdict::Flagged, "{kind:?}: {at:?}");
         assert_eq!(at.dropped, Some(at.gaussians));
@@ -117,10 +117,10 @@ fn each_failure_mode_is_flagged_only_where_its_kind_is_lost() {
 }
 
 #[test]
-fn losing_what_is_of_no_kind_flags_nothing() {
-    let scene = looked();
+fn losing_gaussians_of_no_kind_flags_no_failure_mode() {
+    let scene = scored_scene();
     // Every third wall Gaussian: a large and visible loss.
-    let found = scene.without(|i| scene.traits[i] == [false; 3] && i % 3 == 0);
+    let found = scene.without(|i| scene.kinds[i] == [false; 3] && i % 3 == 0);
     assert!(found.iter().all(|of| of.verdict == Verdict::Untouched), "{found:?}");
     assert!(found[1].psnr_elsewhere.unwrap() < VISIBLE_ERROR_PSNR_DB, "the loss is not visible: {found:?}");
     let nothing = scene.without(|_| false);
@@ -154,7 +154,7 @@ fn verdicts_follow_the_stated_thresholds() {
 }
 
 #[test]
-fn shares_of_pixels_are_those_of_the_gaussians_seen_there() {
+fn pixel_shares_are_those_of_the_gaussians_visible_there() {
     let mut state = Gaussians::zeros(2, 0);
     for (i, y) in [0.0f32, 2.0].into_iter().enumerate() {
         state.position.set_row(i, [0.0, y, 0.0]);
@@ -172,7 +172,7 @@ fn shares_of_pixels_are_those_of_the_gaussians_seen_there() {
 }
 
 #[test]
-fn the_worst_square_is_where_the_kinds_error_is() {
+fn worst_square_has_the_largest_error_of_the_kind() {
     let image = |value: f32| Image { width: 100, height: 90, data: vec![value; 27_000] };
     let mut taken = RenderedViews { original: image(0.5), compressed: image(0.5), truth: None };
     let mut shares = image(0.0);
