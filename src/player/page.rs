@@ -252,7 +252,8 @@ impl ChunkFiles {
             let (from, to) = (self.folder.path().join(file), folder.join(file));
             fs::copy(&from, &to).map_err(Error::io("write", &to))?;
         }
-        // The policy allows scripts that the page itself adds: files from a disk have no origin that it could name.
+        // A chunk file on a disk has no origin that the policy could name. So the policy allows the scripts that the
+        // page itself adds.
         let page = head(stage, &["'strict-dynamic'".to_owned()]) + "</body>\n</html>\n";
         let path = folder.join(INDEX_FILE);
         fs::write(&path, &page).map_err(Error::io("write", &path))?;
@@ -276,7 +277,7 @@ fn head(stage: &PageScene, chunks: &[String]) -> String {
     page = page.replace("/*tool*/", TOOL).replace("/*shaders*/", &inline(&shaders.into()));
     let image = |uri: &String| format!("<img id=\"poster\" alt=\"First frame of the scene\" src=\"{uri}\">");
     page = page.replace("<!--poster-->", &stage.poster.as_ref().map_or(String::new(), image));
-    // Names may contain any text, so they are inserted after all replacements.
+    // Names may contain any text, even a placeholder, so they are inserted after all replacements.
     let begin = format!("splatsieve.begin({});", inline(&json));
     let own = [between(&page, "<script>", "</script>"), &begin].map(policy_digest);
     let scripts: Vec<String> = own.into_iter().chain(chunks.iter().cloned()).collect();
@@ -331,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn every_mark_is_replaced_once_and_names_stay_text() {
+    fn every_placeholder_is_replaced_once_and_names_stay_text() {
         let page = head(&stage("</script><script>alert(1)//*page.css*/"), &[]);
         assert!(!page.contains("<script>alert") && page.contains("\\u003c/script>\\u003cscript>alert(1)//*page.css*/"));
         for (mark, _) in PARTS.iter().chain(&[("/*shaders*/", ""), ("/*tool*/", "")]) {

@@ -58,7 +58,7 @@ pub fn render_poster(
 /// Returns the memory for rendering a poster, in bytes, as two parts: an amount per Gaussian, and an amount for the
 /// render itself.
 pub fn poster_memory() -> [MemoryPart; 2] {
-    // Three channels of f32, their bytes, and the JPEG.
+    // 16 bytes per pixel: three channels of f32, their 8-bit values, and the JPEG.
     [("poster", SHARED_VIEW_BYTES_PER_GAUSSIAN), ("poster", render::STRIP_BYTES as u64 + 16 * MAX_PIXELS as u64)]
 }
 
@@ -68,7 +68,7 @@ fn smaller(camera: &Camera) -> Camera {
     let scale = (MAX_PIXELS / pixels).sqrt().min(1.0);
     let side = |pixels: u32| (f64::from(pixels) * scale).floor().max(1.0);
     let (width, height) = (side(camera.width), side(camera.height));
-    // Sides are whole pixels, so both directions have scales of their own.
+    // Width and height are rounded to whole pixels, so x and y have different scales.
     let (across, down) = (width / f64::from(camera.width), height / f64::from(camera.height));
     Camera {
         width: width as u32,

@@ -75,8 +75,8 @@ pub fn component_count(sh_degree: usize) -> usize {
 /// `[components, N]`. Leaves the other attributes in `points` as they are. Returns the number of Gaussians that become
 /// invisible.
 ///
-/// - Quaternions are normalized. Of the two signs of a quaternion, the one closer to the quaternion that `points` held
-///   before (that of the previous frame) is taken.
+/// - Quaternions are normalized. A quaternion and its negative are the same rotation; the one that is closer to the
+///   quaternion of the previous frame, which `points` still holds, is written.
 /// - A Gaussian gets opacity 0, and is invisible, if one of its values is NaN or if a coordinate of its position is at
 ///   least [`POSITION_LIMIT`] quantization steps away from 0.
 ///
@@ -139,7 +139,7 @@ pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &PlayerSteps,
     accuracy.check("a page")
 }
 
-/// Returns the multiple of `step` that is nearest to `value`; 0 for NaN.
+/// Returns the integer k for which k · `step` is nearest to `value`; 0 for NaN.
 fn nearest(value: f64, step: f64) -> i32 {
     (value / step).round_ties_even() as i32
 }

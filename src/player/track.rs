@@ -106,17 +106,17 @@ impl PageSequence {
     }
 }
 
-/// Returns the attributes that are encoded for every frame. These are the attributes that vary with time (`varying`)
-/// and, if there are any, the opacity. The opacity is needed because a Gaussian is hidden by opacity 0 at frames where
-/// it has values that cannot be shown.
+/// Returns the attributes that are encoded for every frame: the attributes that vary with time (`varying`) and, if
+/// there are any, the opacity. The opacity is needed because a Gaussian is hidden by opacity 0 at frames where it has
+/// values that cannot be shown.
 fn changing(varying: Attributes) -> Attributes {
     if varying.is_empty() { varying } else { varying | Attributes::OPACITY }
 }
 
 /// Encodes the frames `frames` of `source` for the player page. `track` is the description of the sequence, planned for
 /// these frames. Passes each chunk with its index to `sink`, in order. Stores the largest number of invisible Gaussians
-/// in `track.unseen`. Some sources decode several frames together; at most `held` decoded frames are then kept in
-/// memory.
+/// in `track.unseen`. `held`: maximum number of decoded frames in memory, for sources that decode several frames
+/// together.
 ///
 /// # Errors
 /// Fails if a frame cannot be read, if a position cannot be stored accurately, or if `sink` fails.
@@ -175,9 +175,9 @@ pub fn encode(
     Ok(())
 }
 
-/// Encodes scalar components (such as the x of the position) as a compressed chunk. Each item of `components` is a pair
-/// of quantized values of one component: the values of all Gaussians at the first frame of the sequence, and a list of
-/// their values at every frame of the chunk.
+/// Encodes scalar components (such as the x of the position) as a compressed chunk. `components` has for each component
+/// the quantized values of all Gaussians at the first frame of the sequence, and a list of their values at each frame
+/// of the chunk.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
     let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));
@@ -190,9 +190,9 @@ fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
 }
 
 /// Encodes one scalar component (such as the x of the position) for a chunk, and returns its bytes: a byte of flags,
-/// then the differences between frames. Of these, first the lowest byte of every difference, then the next byte of
-/// every difference, and so on. `start` has the values at the first frame of the sequence, `frames` the values at the
-/// frames of the chunk.
+/// then the codes of the differences between frames (see [`differences`]). The lowest byte of every code comes first,
+/// then the next byte of every code, and so on. `start` has the values at the first frame of the sequence, `frames` the
+/// values at the frames of the chunk.
 fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     let mut orders = [false, true].map(|is_second| differences(start, frames, is_second));
     let cost = |values: &[u32]| values.iter().map(|&v| u64::from(32 - v.leading_zeros())).sum::<u64>();
@@ -207,8 +207,8 @@ fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     bytes
 }
 
-/// Returns the differences of one component between successive frames, Gaussian by Gaussian. A difference d is returned
-/// as 2d, or as −2d − 1 if it is negative. A value of a Gaussian is compared with:
+/// Returns the codes of the differences of one component between successive frames, Gaussian by Gaussian. The code of a
+/// difference d is 2d, or −2d − 1 if d is negative. A value of a Gaussian is compared with:
 /// - its value in `start`, if it is the first value;
 /// - its value at the frame before, if it is the second value, or a later value and `is_second` is false;
 /// - the linear extrapolation of its two values before, if it is a later value and `is_second` is true. Steady motion
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_unpacked_is_within_half_a_step_of_every_value() {
+    fn decoded_values_are_within_half_a_step() {
         let scene = demo_scene::DemoScene::new(700, 47);
         let frames = [0, 1, 2, 5, 9, 12, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 46];
         let (track, chunks) = encoded(&scene, &frames, 3);
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn one_frame_is_one_chunk_and_fewer_bands_are_fewer_components() {
+    fn one_frame_is_one_chunk_and_degree_0_has_14_components() {
         let scene = demo_scene::DemoScene::new(300, 5);
         let (track, chunks) = encoded(&scene, &[3], 0);
         assert_eq!((track.chunk_count(), track.sh_degree, track.varying.len()), (1, 0, 0));

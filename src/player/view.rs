@@ -101,7 +101,7 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
         let work = scene.workload();
         let work = Workload { gaussians: work.gaussians.max(most), ..work };
         MemoryPlan::fit_budget(work, options.original.memory, &options.original.events, |work, limits| {
-            vec![need(work, limits)]
+            vec![estimate(work, limits)]
         })?
         .limits
     };
@@ -118,10 +118,10 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
     let (mut chunks, mut notes) = (ChunkFiles::new(&scratch)?, std::mem::take(&mut scene.notes));
     let asked = ModelView { role: "original", path: &scene.path, frames, degree };
-    let mut models = vec![show(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];
+    let mut models = vec![add_model(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];
     if let Some((path, model)) = options.compressed.as_deref().zip(compressed.as_deref()) {
         let asked = ModelView { role: "compressed", path, frames: all, degree: NO_SH_LIMIT };
-        models.push(show(model, 1, &asked, steps, &limits, &mut chunks, &scene.events)?);
+        models.push(add_model(model, 1, &asked, steps, &limits, &mut chunks, &scene.events)?);
     }
     for model in models.iter().filter(|model| model.track.unseen > 0) {
         let (name, unseen) = (&model.name, model.track.unseen);
@@ -173,9 +173,9 @@ struct ModelView<'a> {
 }
 
 /// Encodes the frames of `model` as model number `place` of the page, and adds the encoded chunks (groups of frames) to
-/// `chunks`. Returns the description of the model for the page. `asked` holds the settings for this model, and `steps`
-/// the quantization steps.
-fn show(
+/// `chunks`. Returns the description of the model for the page. `asked`: settings for this model. `steps`: quantization
+/// steps.
+fn add_model(
     model: &dyn InputModel,
     place: usize,
     asked: &ModelView<'_>,
@@ -212,7 +212,7 @@ fn evenly(frames: usize, count: usize) -> Vec<usize> {
 }
 
 /// Returns the resource estimate (memory, time, reads) of encoding the frames of one model for the page.
-fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
+fn estimate(work: &Workload, limits: &Limits) -> ResourceEstimate {
     let [per_gaussian, render] = poster::poster_memory();
     let points = 4 * component_count(work.sh_degree) as u64;
     let of_all = points / 4 * work.gaussians * work.frames.max(1);
@@ -227,7 +227,8 @@ fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
             ("points", 3 * points),
             per_gaussian,
         ],
-        // The group, eight of its components as differences and as bytes, and the compressed chunk.
+        // Part `group`: the frames of a group, eight of its components as differences and as bytes, and the compressed
+        // chunk.
         fixed: vec![work.block_buffer_memory(), render, ("group", 10 * of_all.min(MAX_VALUES_PER_FRAME_GROUP as u64))],
     }
 }

@@ -4,9 +4,9 @@ precision highp float;
 
 uniform highp sampler2D left;
 uniform highp sampler2D right;
-uniform vec2 corner;      // of this image on the canvas
-uniform float cut;        // column from which the right one is shown
-uniform float gain;       // above 0: their difference, times this
+uniform vec2 corner;      // lower left corner of the images on the canvas
+uniform float cut;        // column of the images from which the right one is shown
+uniform float gain;       // if above 0, the difference of the images times this is shown
 out vec4 paint;
 
 void main() {

@@ -55,7 +55,7 @@ class Painter {
         return framebuffer;
     }
 
-    /// Binds textures to the samplers of these names.
+    /// Binds textures to samplers. `textures`: for each name of a sampler, the texture and its kind.
     bind(at, textures) {
         Object.entries(textures).forEach(([name, [texture, kind]], unit) => {
             this.gl.activeTexture(this.gl.TEXTURE0 + unit);
@@ -64,7 +64,7 @@ class Painter {
         });
     }
 
-    /// Returns image `place`, of this size.
+    /// Returns image `place` (texture and framebuffer). Makes it anew if it does not have this size.
     picture(place, width, height) {
         const gl = this.gl;
         let picture = this.pictures[place];
@@ -115,7 +115,8 @@ class Painter {
         });
     }
 
-    /// Copies two images to the canvas from column `x` on, the right one from its column `cut` on; with `gain` their difference.
+    /// Draws two images in one place of the canvas, from its column `x` on: `left` in their columns before `cut`, `right` in the
+    /// others. If `gain` is above 0, draws their difference times `gain` instead.
     put(left, right, x, cut, gain) {
         const gl = this.gl, { program, at } = this.compose;
         gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -158,7 +159,7 @@ class Figure {
         gl.vertexAttribDivisor(0, 1);
     }
 
-    /// Takes an answer of the worker.
+    /// Copies an answer of the worker to the graphics card: the attributes that changed, and the order of the Gaussians.
     take(message) {
         const gl = this.painter.gl;
         for (const name of ["place", "turn", "extent"]) {
@@ -175,7 +176,7 @@ class Figure {
         this.visible = message.order.length;
     }
 
-    /// Computes the footprints of all Gaussians.
+    /// Computes the footprints of all Gaussians on the screen, for the given camera.
     project({ rows, eye, focal, principal, size, near }) {
         const { painter, track } = this, gl = painter.gl, { program, at } = this.program;
         gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);

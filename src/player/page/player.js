@@ -182,7 +182,7 @@ function fit() {
     const width = el("stage").clientWidth / (mode() === "beside" ? 2 : 1), height = el("stage").clientHeight;
     return { width, height, scale: Math.min(width / camera.size[0], height / camera.size[1]) };
 }
-/// Returns the camera's numbers for one image of the canvas.
+/// Returns the camera parameters for one image on the canvas, in pixels of this image.
 function sight() {
     let { width, height } = fit();
     const dense = exact ? 1 : Math.min(devicePixelRatio || 1, 2) * coarse;
@@ -195,7 +195,7 @@ function sight() {
         principal: camera.principal.map((p, k) => (p - camera.size[k] / 2) * scale + [width, height][k] / 2),
     };
 }
-let current; // the camera numbers that the workers sorted for
+let current; // camera parameters by which the workers sorted the Gaussians
 function draw() {
     const { canvas } = painter.gl, [width, height] = current.size;
     const wide = mode() === "beside" ? 2 * width : width;
@@ -211,7 +211,7 @@ function draw() {
 async function refresh() {
     isBusy = true;
     isDirty = false;
-    // Frames that have not arrived yet are replaced by the last one that has.
+    // If the frame at this time has not arrived yet, the last frame that has arrived is shown instead.
     const until = Math.min(...seen().map((place) => models[place].until));
     if (until > -Infinity) {
         const at = Math.min(time, until), from = sight(), isWhole = exact || coarse === 1;
@@ -231,7 +231,7 @@ async function refresh() {
     isBusy = false;
 }
 
-/// Shows the frames per second. Where they are few, moving frames are drawn coarser.
+/// Shows the number of frames drawn per second. If it is low, reduces the resolution while something moves.
 function rate() {
     const now = performance.now();
     // A still image needs no speed.
@@ -345,7 +345,8 @@ function setUp() {
     obey();
 }
 
-/// Obeys #camera=VIEW&time=T&frame=K&show=MODE&cut=PART&paused&exact of a link; exact draws in the camera's own pixels.
+/// Applies the settings #camera=VIEW&time=T&frame=K&show=MODE&cut=PART&paused&exact of a link. With exact, an image has the pixels
+/// of the camera.
 /// With ?embed or #embed the page shows the scene without controls.
 function obey() {
     const asked = new URLSearchParams(location.hash.slice(1));

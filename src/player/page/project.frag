@@ -58,7 +58,8 @@ vec3 shade(ivec2 at, vec3 d) {
     return max(0.5 + harmonicStep * sum, 0.0);
 }
 
-// Returns the pixels [x, y) of a row that lie in tiles within `radius` and within `half_`.
+// Returns the pixels [start, stop) along one axis on which a Gaussian with its center at `at` is drawn: in tiles that reach within
+// `radius` of the center, at most `half_` away from it, and within the image of `end` pixels.
 vec2 span(float at, float radius, float half_, float end) {
     float start = max(floor((at - radius) / TILE) * TILE, ceil(at - half_));
     float stop = min(floor((at + radius + TILE - 1.0) / TILE) * TILE, floor(at + half_) + 1.0);

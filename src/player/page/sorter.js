@@ -1,6 +1,6 @@
 "use strict";
-// Model in a worker: unpacks its chunks (format: src/player/track.rs), computes the state at a time and sorts it by depth. Each
-// "show" gets one answer.
+// Web worker of one model: unpacks its chunks (format: src/player/track.rs), computes the state of its Gaussians at a
+// time, and sorts them by depth. Each message "show" gets one answer.
 
 const WIDTH = 2048;          // texels across
 const KEPT = 400e6;          // maximum bytes of unpacked groups in memory
@@ -8,7 +8,7 @@ let track, moving, base, rows;
 const packed = new Map();    // chunk -> its bytes
 const groups = new Map();    // chunk -> its unpacked components, the most recently used last
 let keptBytes = 0;
-let last = {};               // values that the page has already
+let last = {};               // last answer: frames a and b, position `part` between them, texels `place`
 let turn = Promise.resolve();
 
 onmessage = ({ data }) => {
@@ -43,7 +43,8 @@ async function inflated(bytes) {
     return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/// Returns components as planes, frame by frame; null for a constant component.
+/// Unpacks a chunk of `frames` frames. Returns the values of each of `components`, frame by frame, or null for a component that
+/// equals `base` at all these frames. `bytes`: bytes of memory that the values take.
 async function unpack(packedBytes, components, frames) {
     const bytes = await inflated(packedBytes);
     const count = track.count, size = count * frames;
@@ -89,7 +90,7 @@ async function group(place) {
     return found;
 }
 
-/// Returns the points of `component` at `frame`, and their offset.
+/// Returns a function that gives, for a component, an array with its quantized values, and the index where those of `frame` begin.
 async function frameAt(frame) {
     if (frame === 0) return (component) => [base[component], 0];
     const place = track.groups.findIndex((first) => first > frame);
@@ -111,7 +112,8 @@ function around(time) {
     return part < 1e-9 ? [after - 1, after - 1, 0] : [after - 1, after, part];
 }
 
-/// Returns the attributes that differ from the last answer, as texels. Between frames they are interpolated linearly.
+/// Returns the attributes at `time` that differ from the last answer, as texels. Between two frames, values are interpolated
+/// linearly.
 async function stateAt(time) {
     const [a, b, part] = around(time);
     if (last.a === a && last.b === b && last.part === part) return {};
@@ -149,8 +151,9 @@ async function stateAt(time) {
 
 const bits = new Uint32Array(1), number = new Float32Array(bits.buffer);
 
-/// Returns the Gaussians in front of the near plane, the furthest first. Equal depths have the rasterizer's order, reversed. A radix
-/// sort over both halves of the depth's bits works because the bits of positive numbers are in their order.
+/// Returns the ids of the Gaussians in front of the near plane with an opacity of at least 1/255, the furthest first. Equal depths
+/// have the rasterizer's order, reversed. The radix sort over both halves of the bits of the depth works because the bits of
+/// positive numbers are in the order of the numbers.
 function sorted({ row, eye, near }) {
     const { count } = track, place = last.place;
     const keys = new Uint32Array(count), ids = new Uint32Array(count), spare = new Uint32Array(count);
