@@ -52,9 +52,9 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     write_without_companions(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
 }
 
-/// Returns the `target_count` ids out of `ids` that `baseline` keeps: the Gaussians with the largest values of the
-/// property by which it ranks. The returned ids increase. Row i of `state` holds the attributes of the Gaussian with
-/// the id i.
+/// Returns the `target_count` ids out of `ids` that `baseline` keeps, in increasing order: those of the Gaussians with
+/// the largest values of the property by which it ranks. Row i of `state` holds the attributes of the Gaussian with the
+/// id i.
 fn largest(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, target_count: usize) -> Vec<u32> {
     let value = |id: u32| -> f32 {
         let row = id as usize;

@@ -82,7 +82,7 @@ impl Method {
             recipe.bands.bands = ShDegreeRule::All;
             recipe.scan.coverage = coverage;
             recipe.score.static_term = StaticScoreTerm::Mean;
-            // S = C without clipping, so that Gaussians with different C never tie.
+            // The score S is then C, without clipping. So Gaussians with different C never tie.
             recipe.score.w_dynamic = 0.0;
             recipe.score.clip_norm = false;
             recipe.select.round_fraction = 1.0;

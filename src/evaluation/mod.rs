@@ -549,8 +549,8 @@ fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<F
     last
 }
 
-/// Scores of one view. First: scores of the compressed model against the original. Second: scores of each model against
-/// the photograph, if there is one.
+/// Scores of one view at one frame. First: scores of the compressed model against the original. Second: scores of each
+/// model against the photograph, if there is one.
 type PairScores = (ImageScore, Option<OriginalAndCompressed<ImageScore>>);
 
 /// Images of one view at one frame, all of the same size.
@@ -568,7 +568,7 @@ impl RenderedViews {
     /// error. `with_flip`: whether to compute FLIP.
     fn scores(&self, before: Option<&RenderedViews>, with_flip: bool) -> PairScores {
         let size = |rendered: &RenderedViews| (rendered.original.width, rendered.original.height);
-        // The image size can change with the camera of a view; then there is no temporal error.
+        // The image size can change with the camera of a view. Then the view has no temporal error.
         let before = before.filter(|before| size(before) == size(self));
         let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]), with_flip);
         let truth = self.truth.as_ref().map(|truth| {

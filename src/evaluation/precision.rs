@@ -34,7 +34,7 @@ pub struct PrecisionDiagram {
     pub judged: usize,
     /// File of the cameras, or description of the virtual rig (cameras that the program placed).
     pub cameras: String,
-    /// Number of Gaussians that are kept with every setting.
+    /// Number of Gaussians that every setting keeps.
     pub kept: usize,
     /// Number of threads of all measurements except those that vary the number of threads.
     pub threads: usize,
@@ -114,7 +114,7 @@ pub struct PrecisionCurve {
 /// Measurements with one setting, that is, at one value of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionSetting {
-    /// Value of the parameter that the command `precision` varies.
+    /// Value of the varied parameter in this setting.
     pub value: f64,
     /// Step size h that belongs to this value: an error of order p is proportional to h^p. For sums over frames, h is
     /// the number of frames, because rounding errors grow with it.
@@ -144,8 +144,8 @@ pub struct ObservedOrder {
 /// the whole model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
 /// Name of the error that a setting adds to renders: √(e² − f²) / f (see [`added_error`]). Here e is the error
-/// [`RENDER_ERROR`] of the setting, and f is the error [`RENDER_ERROR`] of the finest setting, which counts as the
-/// error of the compressed model itself.
+/// [`RENDER_ERROR`] of the setting. f is the error [`RENDER_ERROR`] of the finest setting, which counts as the error of
+/// the compressed model itself.
 pub const ADDED_ERROR: &str = "added";
 /// Name of the error: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest
 /// setting keeps.
@@ -196,7 +196,7 @@ impl PrecisionCurve {
         let mut names: Vec<String> = marks.iter().flat_map(|mark| mark.errors.keys().cloned()).collect();
         names.sort_unstable();
         names.dedup();
-        // The error of renders converges to the model's own error, not to 0, so it has no order.
+        // The error of renders converges to the error of the model itself, not to 0, so it has no order.
         names.retain(|name| name != RENDER_ERROR);
         let order = |error: String| {
             let points = marks.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&error)?)));
@@ -220,8 +220,8 @@ impl PrecisionCurve {
     }
 }
 
-/// Returns the least-squares slope of log error against log step size. `points` are pairs (step, error), of which those
-/// with a step or an error of 0 are ignored. Returns `None` if fewer than three pairs remain or all have the same step.
+/// Returns the least-squares slope of log error against log step size. `points`: pairs (step, error); pairs with a step
+/// or an error of 0 are ignored. Returns `None` if fewer than three pairs remain or all have the same step.
 fn slope(points: impl Iterator<Item = (f64, f64)>) -> Option<f64> {
     let logs: Vec<(f64, f64)> = points
         .filter(|&(step, error)| step > 0.0 && error > 0.0)
@@ -249,9 +249,9 @@ pub(crate) fn jaccard_distance(a: &[u32], b: &[u32]) -> f64 {
     if either == 0 { 0.0 } else { 1.0 - both as f64 / either as f64 }
 }
 
-/// Returns the error that a setting adds to the error `finest` of the finest setting, relative to `finest`: √(`error`²
-/// − `finest`²) / `finest`. `error` is the whole error of the setting; independent errors add in squares. Returns 0 if
-/// `error` is below `finest`.
+/// Returns the error that a setting adds to the error of the finest setting, relative to it: √(`error`² − `finest`²) /
+/// `finest`, or 0 if `error` is below `finest`. Independent errors add in squares. `error`: whole error of the setting.
+/// `finest`: error of the finest setting.
 pub(crate) fn added_error(error: f64, finest: f64) -> f64 {
     ((error * error - finest * finest).max(0.0)).sqrt() / finest.max(f64::MIN_POSITIVE)
 }

@@ -66,7 +66,7 @@ pub struct QualityMeans {
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// Mean temporal error: flicker of a view from its previous evaluated frame to this one. The mean is over the
+    /// Mean temporal error: flicker of a view between its previous evaluated frame and this one. The mean is over the
     /// (frame, view) pairs that have a temporal error; the first frame of a view has none. `None` if no pair has one.
     pub temporal: Option<f64>,
     /// Mean FLIP; `None` if it was not requested.
@@ -91,8 +91,8 @@ pub struct FrameMeans {
     pub frame: usize,
     /// Time stamp of the frame.
     pub time: f64,
-    /// Means of the scores over the views of this frame. The temporal error (flicker) of a view compares it with the
-    /// previous evaluated frame.
+    /// Means of the scores over the views of this frame. The temporal error of a view (its flicker) is between the
+    /// previous evaluated frame and this one.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
@@ -404,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn sides_of_the_rig_are_averaged_apart() {
+    fn views_inside_and_outside_the_rig_are_averaged_separately() {
         let views = [picture(0, 1, 30.0, None), picture(0, 2, 20.0, None), picture(1, 1, 40.0, None)];
         let sides = InsideOutsideMeans::from_views(&views, &[false, true, false]).unwrap();
         assert_eq!((sides.inside.unwrap().psnr, sides.outside.psnr, sides.outside.pairs), (35.0, 20.0, 1));

@@ -27,7 +27,7 @@ pub struct TradeOff {
     pub pictures: usize,
     /// File of the cameras, or description of the virtual rig (cameras that the program placed).
     pub cameras: String,
-    /// Number of runs of every measurement.
+    /// Number of runs by which each point was measured; times are their medians.
     pub runs: usize,
     /// Measurements in the order of the option `--methods`, then by decreasing requested fraction.
     pub points: Vec<TradeOffPoint>,
