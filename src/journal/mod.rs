@@ -57,8 +57,8 @@ fn processor_seconds() -> Option<f64> {
 /// Journal: record of the stages of a run so far, or of one stage whose result is in the cache.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
-    /// Amounts that one full read of the input (every frame once) takes: bytes, tiles (compressed blocks of values) and
-    /// states (one Gaussian at one frame). The reads of a stage are reported as a multiple of these amounts.
+    /// Amounts that one full read of the input (every frame once) takes: bytes, tiles (compressed blocks of values),
+    /// and states (one Gaussian at one frame). The reads of a stage are reported as multiples of these amounts.
     #[serde(skip)]
     pub whole: Reads,
     /// Records of the stages that have run, in order.
@@ -96,7 +96,7 @@ impl Journal {
         let (start, before, scratch) = (Stopwatch::start(), source.reads(), Spill::bytes_read_back());
         let (value, gaussians_out) = work(self)?;
         let (reads, scratch) = (source.reads() - before, Spill::bytes_read_back() - scratch);
-        self.add(name, [gaussians_in, gaussians_out], start, reads, scratch);
+        self.record_stage(name, [gaussians_in, gaussians_out], start, reads, scratch);
         Ok(value)
     }
 
@@ -124,9 +124,8 @@ impl Journal {
         })
     }
 
-    /// Returns the mean PSNR of the result, before a fit to photographs, against the original on validation views (used
-    /// to choose, not to fit), dB.
-    /// The value is from the last stage that measured it; `None` if no stage did.
+    /// Returns the mean PSNR of the result against the original on validation views (used to choose, not to fit), dB,
+    /// before a fit to photographs. The value is from the last stage that measured it; `None` if no stage did.
     pub fn result_psnr(&self) -> Option<f64> {
         let bands = self.bands.as_ref().map(|bands| bands.result);
         let field = self.field.as_ref().and_then(|field| field.result);
@@ -167,10 +166,10 @@ impl Journal {
         Ok(found)
     }
 
-    /// Adds an entry for the opening of the input, as the stage `name`. The opening began at `start`, found `gaussians`
-    /// Gaussians and read the amounts `reads`.
+    /// Adds an entry for the opening of the input, as the stage `name`. `start`: stopwatch that was started before the
+    /// opening. `gaussians`: number of Gaussians found. `reads`: amounts that were read.
     pub fn record_opening(&mut self, name: &'static str, start: Stopwatch, gaussians: usize, reads: Reads) {
-        self.add(name, [0, gaussians], start, reads, 0);
+        self.record_stage(name, [0, gaussians], start, reads, 0);
     }
 
     /// Adds an entry for the omitted work `what` with the reason `why`.
@@ -184,7 +183,9 @@ impl Journal {
         self.left_out.push(OmittedWork { what: what.into(), why: why.into(), saved: Some(saved) });
     }
 
-    fn add(
+    /// Adds the record of the stage `name`, which began at `start` and ends now. `reads`: amounts that it read from the
+    /// input. `scratch_bytes`: number of bytes that it read back from scratch files.
+    fn record_stage(
         &mut self,
         name: &str,
         [gaussians_in, gaussians_out]: [usize; 2],

@@ -59,7 +59,7 @@ pub enum SavedCost {
         /// Maximum amount that the stage would have read, in full reads (every frame of the input once).
         reads: f64,
     },
-    /// Cost of values that were not read again, because their attributes are the same in every frame.
+    /// Cost of values that were not read again, because their attribute is the same in every frame.
     Values {
         /// Number of bytes of the values that were not read again.
         bytes: u64,
@@ -86,8 +86,8 @@ impl OmittedWork {
     }
 }
 
-/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. The value null in place of the
-/// number becomes NaN.
+/// Deserializes pairs of an integer and a number, such as a number of Gaussians and a PSNR. If the number is null,
+/// which JSON writes for numbers that are not finite, it becomes NaN.
 pub(crate) fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
     Ok(found.into_iter().map(|(size, value)| (size, value.unwrap_or(f64::NAN))).collect())
@@ -111,8 +111,8 @@ pub struct FieldSummary {
     /// Mean PSNR of renders with the exact deformation field, compared with renders of the original, dB; `None` if it
     /// was not measured, because `rounding` is so high (60 dB or more) that half precision is used in any case.
     pub result: Option<f64>,
-    /// Minimum PSNR, dB, that `rounding` must reach; the deformation field is then written in half precision.
-    /// `rounding` is the PSNR of renders with the half-precision field, compared with renders with the exact field.
+    /// Minimum of `rounding`, dB, at which the deformation field is written in half precision. `rounding` is the PSNR
+    /// of renders with the half-precision field against renders with the exact field.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }
@@ -267,7 +267,7 @@ pub struct Forecast {
     pub core_seconds: EstimateRange,
     /// Number of threads that the run uses.
     pub threads: u64,
-    /// Whether the speed of this machine was measured on the scene for this forecast.
+    /// Whether this forecast uses the speed of this machine, measured on the scene.
     pub measured: bool,
     /// Expected peak memory of the process by the memory plan, bytes.
     pub memory_bytes: u64,
@@ -279,7 +279,7 @@ pub struct Forecast {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
     /// Name of the term of the score, as returned by
-    /// [`Quantity::name`](crate::statistics::score::ScoredQuantity::name).
+    /// [`ScoredQuantity::name`](crate::statistics::score::ScoredQuantity::name).
     pub name: String,
     /// First percentile: value that 1% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
@@ -292,7 +292,8 @@ pub struct TermSummary {
     pub active: bool,
 }
 
-/// Numbers of Gaussians with unusual values.
+/// Numbers of Gaussians with unusual values, one number for each kind of unusual value. A Gaussian can count for
+/// several kinds.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct FlagSummary {
     /// Number of Gaussians with NaN or infinity in some frame.
