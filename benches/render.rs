@@ -2,17 +2,17 @@
 //! a render with its gradients.
 //!
 //! The images are:
-//! - `picture/*`: one view of each trained model, with its frame state given (skipped if the models are missing). The
+//! - `view/*`: one view of each trained model, with its frame state given (skipped if the models are missing). The
 //!   goal is 25 ms for the render of `room2_big`. The C++ AVX-512 port of the original rasterizer takes 26, 14 and 12
 //!   ms for `room2_big`, `room2_dynerf` and `deform2`, measured elsewhere.
-//! - `picture/large`: a 1352×1014 view of 200,313 Gaussians: `room2_dynerf` with each Gaussian split into nine.
-//! - `picture/demo`: a view of the demo scene.
+//! - `view/large`: a 1352×1014 view of 200,313 Gaussians: `room2_dynerf` with each Gaussian split into nine.
+//! - `view/demo`: a view of the demo scene.
 //! - `size/*`: 10,000 to a million synthetic Gaussians in a 640×512 image.
 //!
 //! The benchmarks of an image are:
 //! - `render`: the render alone.
 //! - `gradient`: the render with the derivative of its squared error by every stored value. The goal is 2.6 times the
-//!   render alone; `picture/large` misses it with 2.7. The ratio of the median times is printed before each group. It
+//!   render alone; `view/large` misses it with 2.7. The ratio of the median times is printed before each group. It
 //!   includes the subtraction of two images for the loss.
 //! - `score_every_1`, `_2` and `_4`: scoring on every pixel, or every second or fourth in each direction.
 //!
@@ -26,7 +26,7 @@
 //! the bytes that must be moved at the measured memory bandwidth.
 //!
 //! Times are wall-clock times: on a busy machine they are several times the cost. Criterion arguments filter: `cargo
-//! bench --bench render -- picture`.
+//! bench --bench render -- view`.
 
 #[path = "../tests/models/mod.rs"]
 mod models;
@@ -48,7 +48,7 @@ use synthetic::{blend_limit, cloud, fastest};
 
 /// Number of renders from which each median time is computed. The printed rates, and the ratio of a render with
 /// gradients to a render without, follow from these medians.
-const PICTURES: usize = 21;
+const RENDERS: usize = 21;
 
 /// Measures rendering, scoring and gradients of the Gaussians `state` seen from `camera`, as the benchmark `name` of
 /// the group `group`.
@@ -58,22 +58,22 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     let mut renderer = Renderer::new();
     let target = renderer.render(state, camera, [0.5; 3]);
     // Derivative of half the squared error; its value is not used.
-    let squared_error = |picture: &Image| {
-        let pull: Vec<f32> = picture.data.iter().zip(&target.data).map(|(a, b)| a - b).collect();
-        (0.0, Image { data: pull, ..*picture })
+    let squared_error = |image: &Image| {
+        let pull: Vec<f32> = image.data.iter().zip(&target.data).map(|(a, b)| a - b).collect();
+        (0.0, Image { data: pull, ..*image })
     };
     let mut gradients = Gradients::new(count, Attributes::all(), state.sh_degree());
     // In alternation, so that other load on the machine slows both.
-    let (mut pictures, mut derivatives) = (Vec::new(), Vec::new());
-    for _ in 0..PICTURES {
+    let (mut renders, mut derivatives) = (Vec::new(), Vec::new());
+    for _ in 0..RENDERS {
         let start = Instant::now();
         drop(black_box(renderer.render(state, camera, [0.0; 3])));
-        pictures.push(start.elapsed().as_secs_f64());
+        renders.push(start.elapsed().as_secs_f64());
         let start = Instant::now();
         black_box(renderer.gradient(state, camera, [0.0; 3], squared_error, &mut gradients));
         derivatives.push(start.elapsed().as_secs_f64());
     }
-    let (seconds, differentiated) = (median(pictures), median(derivatives));
+    let (seconds, differentiated) = (median(renders), median(derivatives));
     let rate = |amount: f64| amount / seconds / 1e6;
     eprintln!(
         "{group} {name}: {count} Gaussians, {pixels} pixels, {events} blend events in {:.1} ms: {:.1}, {:.1} and {:.0} million a second; with its derivative {:.2} times as long",
@@ -108,7 +108,7 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
     let empty = Camera { width: 0, height: 0, ..camera.clone() };
     let mut seen = Contribution::new(state.len());
     let mut times = [const { Vec::new() }; 4];
-    for _ in 0..PICTURES {
+    for _ in 0..RENDERS {
         for (lacking, times) in times.iter_mut().enumerate() {
             let start = Instant::now();
             match lacking {
@@ -160,20 +160,20 @@ fn median(mut values: Vec<f64>) -> f64 {
     values[values.len() / 2]
 }
 
-fn pictures(criterion: &mut Criterion) {
+fn views(criterion: &mut Criterion) {
     let demo = DemoScene::new(DemoScene::DEFAULT_COUNT, DemoScene::DEFAULT_FRAMES);
     let mut state = Gaussians::zeros(0, demo.info().sh_degree);
     let everything = Ids::Range(0..demo.info().count);
     demo.open(everything).unwrap().read(DemoScene::DEFAULT_FRAMES / 2, Attributes::all(), &mut state).unwrap();
-    measure(criterion, "picture", "demo", &state, &demo.rig().cameras[0]);
+    measure(criterion, "view", "demo", &state, &demo.rig().cameras[0]);
     let Some(folder) = models::found() else { return };
     for name in models::NAMES {
         let model = models::Model::open(&folder, name);
         let (frame, view) = model.renders()[0];
         let (state, camera) = (model.state(frame), model.camera(frame, view));
-        measure(criterion, "picture", name, &state, &camera);
+        measure(criterion, "view", name, &state, &camera);
         if name == "room2_dynerf" {
-            measure(criterion, "picture", "large", &split(&state), &enlarged(&camera, [1352, 1014]));
+            measure(criterion, "view", "large", &split(&state), &enlarged(&camera, [1352, 1014]));
         }
     }
 }
@@ -229,5 +229,5 @@ fn sizes(criterion: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, pictures, sizes);
+criterion_group!(benches, views, sizes);
 criterion_main!(benches);

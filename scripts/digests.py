@@ -135,7 +135,7 @@ def cases(binary, data, scratch):
     yield "render", lambda out: run(
         [binary, "render", small, "--cameras", small, "--frame", "7", "--view", "1", "-o", out]), "picture.npy"
     yield "render all", lambda out: run(
-        [binary, "render", demo / "scene.gseq", "--cameras", rig, "--all", "-o", out]), "pictures"
+        [binary, "render", demo / "scene.gseq", "--cameras", rig, "--all", "-o", out]), "renders"
     yield "evaluate csv", lambda out: run(
         [binary, "evaluate", demo / "scene.gseq", demo / "compressed.gseq", "--cameras", rig, "--csv", out]), "e.csv"
 

@@ -54,13 +54,13 @@ def pairs(before, after):
     names = []
     for folder in (before, after):
         if not folder.is_dir():
-            stop(f"{folder}: expected a folder of PNG pictures")
+            stop(f"{folder}: expected a folder of PNG images")
         names.append({path.name for path in folder.glob("*.png")})
     if not names[0]:
-        stop(f"{before}: expected PNG pictures, found none")
+        stop(f"{before}: expected PNG images, found none")
     odd = sorted(names[0] ^ names[1])
     if odd:
-        stop(f"{before} and {after}: expected pictures of the same names, found {odd[0]} in one only ({len(odd)} such)")
+        stop(f"{before} and {after}: expected images of the same names, found {odd[0]} in one only ({len(odd)} such)")
     return sorted(names[0])
 
 
@@ -89,10 +89,10 @@ def main():
         for name in names:
             a, b = read(arguments.before / name), read(arguments.after / name)
             if a.shape != b.shape:
-                stop(f"{name}: expected pictures of one size, found {tuple(a.shape[2:])} and {tuple(b.shape[2:])}")
+                stop(f"{name}: expected images of one size, found {tuple(a.shape[2:])} and {tuple(b.shape[2:])}")
             found[name] = network(a, b).item()
     mean = sum(found.values()) / len(found)
-    print(json.dumps({"metric": "lpips", "net": arguments.net, "mean": mean, "pictures": found}, indent=2))
+    print(json.dumps({"metric": "lpips", "net": arguments.net, "mean": mean, "views": found}, indent=2))
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
         job.write(&chosen, |_| staged.path().to_owned())?;
         staged.commit()?;
     } else {
-        let name = |picture: &FrameView| format!("{}.{}", picture.name(), format.extension());
+        let name = |view: &FrameView| format!("{}.{}", view.name(), format.extension());
         let staged = if scene.work.is_enabled() {
             let key = scene.work.key(&(&chosen, background, format.extension()));
             let make = |some: Range<usize>, to: &mut SpillWriter| job.spill(&chosen[some], to);
@@ -128,12 +128,12 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
             scene.work.end_shard_run_before("writing")?;
             let staged = StagedFolder::new(output, options.overwrite)?;
             for (some, spill) in spills {
-                write_spilled(&chosen[some], &spill, |picture| staged.path().join(name(picture)))?;
+                write_spilled(&chosen[some], &spill, |view| staged.path().join(name(view)))?;
             }
             staged
         } else {
             let staged = StagedFolder::new(output, options.overwrite)?;
-            job.write(&chosen, |picture| staged.path().join(name(picture)))?;
+            job.write(&chosen, |view| staged.path().join(name(view)))?;
             staged
         };
         let marker = serde_json::json!({
@@ -181,39 +181,39 @@ struct RenderJob<'a> {
 }
 
 impl RenderJob<'_> {
-    /// Renders the views `pictures` and writes each render to the file whose path `path` returns for the view.
-    fn write(&self, pictures: &[FrameView], path: impl Fn(&FrameView) -> PathBuf + Sync) -> Result<()> {
-        self.for_each_view(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
+    /// Renders `views` and writes each render to the file whose path `path` returns for the view.
+    fn write(&self, views: &[FrameView], path: impl Fn(&FrameView) -> PathBuf + Sync) -> Result<()> {
+        self.for_each_view(views, |view, image| write_image(image, self.format, &path(&view)), |()| Ok(()))
     }
 
-    /// Renders the views `pictures`, encodes each render as an image file, and writes the files to the temporary data
-    /// `to` instead of the output folder: one record (length and bytes) per view, in order.
-    fn spill(&self, pictures: &[FrameView], to: &mut SpillWriter) -> Result<()> {
-        let encode = |picture: FrameView, image: &Image| {
-            let named = PathBuf::from(format!("{}.{}", picture.name(), self.format.extension()));
+    /// Renders `views`, encodes each render as an image file, and writes the files to the temporary data `to` instead
+    /// of the output folder: one record (length and bytes) per view, in order.
+    fn spill(&self, views: &[FrameView], to: &mut SpillWriter) -> Result<()> {
+        let encode = |view: FrameView, image: &Image| {
+            let named = PathBuf::from(format!("{}.{}", view.name(), self.format.extension()));
             image_bytes(image, self.format).map_err(Error::io("make", &named))
         };
-        self.for_each_view(pictures, encode, |bytes| to.write_record(&bytes))
+        self.for_each_view(views, encode, |bytes| to.write_record(&bytes))
     }
 
-    /// Renders the views `pictures` in batches. Calls `render_one` with each view and its finished render, on any
-    /// thread. After each batch, calls `take` with each value that `render_one` returned, in the order of the views.
+    /// Renders `views` in batches. Calls `render_one` with each view and its finished render, on any thread. After each
+    /// batch, calls `take` with each value that `render_one` returned, in the order of the views.
     fn for_each_view<T: Send>(
         &self,
-        pictures: &[FrameView],
+        views: &[FrameView],
         render_one: impl Fn(FrameView, &Image) -> Result<T> + Sync,
         mut take: impl FnMut(T) -> Result<()>,
     ) -> Result<()> {
-        let progress = self.events.task(NAME, "views", pictures.len() as u64);
+        let progress = self.events.task(NAME, "views", views.len() as u64);
         for_each_view_batch(
             [RenderedSource::all_gaussians(self.source)],
             self.cameras,
-            pictures,
+            views,
             BatchLimits::one_frame(&self.limits),
-            |views| {
+            |batch| {
                 // Renders are parallel inside too, because a frame can have fewer views than there are threads.
-                let made = views.par_iter().map(|view: &ViewStates<'_, 1>| {
-                    let made = render_one(view.picture, &view.render(0, self.background))?;
+                let made = batch.par_iter().map(|view: &ViewStates<'_, 1>| {
+                    let made = render_one(view.frame_view, &view.render(0, self.background))?;
                     progress.advance(1);
                     Ok(made)
                 });
@@ -224,12 +224,12 @@ impl RenderJob<'_> {
 }
 
 /// Copies image files from the temporary data `spill` to files of their own. [`RenderJob::spill`] wrote them, one per
-/// view of `pictures`, in order. `path` returns the path of the file for a view.
-fn write_spilled(pictures: &[FrameView], spill: &Spill, path: impl Fn(&FrameView) -> PathBuf) -> Result<()> {
+/// view of `views`, in order. `path` returns the path of the file for a view.
+fn write_spilled(views: &[FrameView], spill: &Spill, path: impl Fn(&FrameView) -> PathBuf) -> Result<()> {
     let (mut at, mut bytes) = (0, Vec::new());
-    for picture in pictures {
+    for view in views {
         at = spill.read_record(at, &mut bytes)?;
-        let path = path(picture);
+        let path = path(view);
         fs::write(&path, &bytes).map_err(Error::io("write", &path))?;
     }
     Ok(())

@@ -236,23 +236,23 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
     let camera = smaller(&rig.cameras[FILM_VIEW as usize]);
     let frames = crate::source::FrameSource::info(&scene).times.len();
     let step = frames.div_ceil(FILM_FRAMES).max(1);
-    let picture = |frame| FrameView { frame, view: FILM_VIEW, camera: 0 };
-    let pictures: Vec<FrameView> = (0..frames).step_by(step).map(picture).collect();
+    let view = |frame| FrameView { frame, view: FILM_VIEW, camera: 0 };
+    let views: Vec<FrameView> = (0..frames).step_by(step).map(view).collect();
     let path = folder.join(FILM_FILE);
     let size = (3 * FILM_RENDER.0 + 2 * FILM_GAP, FILM_RENDER.1);
-    let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, pictures.len() as u32, FILM_RATE)?;
-    let progress = events.task("film", "frames", pictures.len() as u64);
+    let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, views.len() as u32, FILM_RATE)?;
+    let progress = events.task("film", "frames", views.len() as u64);
     let subjects = [
         RenderedSource::all_gaussians(&scene),
         RenderedSource::all_gaussians(&pruned),
         RenderedSource::all_gaussians(&refined),
     ];
-    for_each_view_batch(subjects, &[camera], &pictures, BatchLimits::one_frame(limits), |views| {
+    for_each_view_batch(subjects, &[camera], &views, BatchLimits::one_frame(limits), |batch| {
         let render = |view: &ViewStates<'_, 3>| {
             let black = rig.background.unwrap_or_default();
             beside([0, 1, 2].map(|subject| view.render(subject, black)))
         };
-        let images: Vec<Image> = views.par_iter().map(render).collect();
+        let images: Vec<Image> = batch.par_iter().map(render).collect();
         images.iter().try_for_each(|image| {
             progress.advance(1);
             film.add_frame(image)

@@ -145,7 +145,7 @@ fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
         gaussians: scene.source().info().count,
         bytes: scene.input.bytes()?,
         threads: rayon::current_num_threads(),
-        pictures: 0,
+        views: 0,
         cameras: scene.rig.origin.clone(),
         runs: options.runs.max(1),
         points: Vec::new(),
@@ -181,7 +181,7 @@ fn measure(
     found: &mut TradeOff,
 ) -> Result<TradeOffPoint> {
     let (evaluation, cost) = run.run(method_kind, fraction.map(Target::Ratio), |result| run.compare(result))?;
-    found.pictures = evaluation.cameras.pairs;
+    found.views = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
     Ok(TradeOffPoint {
         method: method.name().to_owned(),

@@ -144,7 +144,7 @@ pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstim
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
     let mut need = view_selection::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
-    need.fixed.push(("scores", size_of::<ViewScores>() as u64 * work.pictures));
+    need.fixed.push(("scores", size_of::<ViewScores>() as u64 * work.frame_views));
     need.fixed.push(("previous views", 3 * 12 * work.viewpoints * work.pixels));
     vec![need]
 }
@@ -222,9 +222,9 @@ impl ModelPair {
     ) -> Result<()> {
         let scene_work = self.scene.workload();
         let gaussians = scene_work.gaussians.max(self.compressed_count() as u64);
-        let views = scene_work.pictures.max(self.views.len() as u64);
+        let views = scene_work.frame_views.max(self.views.len() as u64);
         let plan = MemoryPlan::fit_budget(
-            Workload { gaussians, pictures: views, ..scene_work },
+            Workload { gaussians, frame_views: views, ..scene_work },
             budget,
             &self.scene.events,
             needs,
@@ -334,8 +334,8 @@ impl ModelPair {
             Some(TruthComparison {
                 folder: folder.to_string_lossy().into_owned(),
                 compared_views: self.views.len(),
-                compressed: Comparison::from_views(&scores, |picture| Some(picture.truth?.compressed))?,
-                original: Comparison::from_views(&scores, |picture| Some(picture.truth?.original))?,
+                compressed: Comparison::from_views(&scores, |view| Some(view.truth?.compressed))?,
+                original: Comparison::from_views(&scores, |view| Some(view.truth?.original))?,
             })
         });
         let scene = &self.scene;
@@ -353,11 +353,11 @@ impl ModelPair {
             size,
             cameras: CameraSummary {
                 origin: scene.rig.origin.clone(),
-                cameras: self.views.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
+                cameras: self.views.iter().map(|view| view.camera).collect::<HashSet<_>>().len(),
                 pairs: self.views.len(),
             },
             background: self.background,
-            loss: Comparison::from_views(&scores, |picture| Some(picture.loss)).expect("every view has this score"),
+            loss: Comparison::from_views(&scores, |view| Some(view.loss)).expect("every view has this score"),
             rig_sides: InsideOutsideMeans::from_views(&scores, &self.outside_views()),
             ground_truth,
             render_ms: None,
@@ -419,24 +419,24 @@ impl ModelPair {
         self.views[place]
     }
 
-    /// Renders the views `pictures` with both models and returns one value of `see` per view, in order. Arguments of
-    /// `see`: the render of the original, then that of the compressed model. `pictures` may be any views of the scene's
-    /// cameras, and must be sorted by frame.
+    /// Renders `views` with both models and returns one value of `see` per view, in order. Arguments of `see`: the
+    /// render of the original, then that of the compressed model. `views` may be any views of the scene's cameras, and
+    /// must be sorted by frame.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or if `see` fails.
     pub fn render_pairs<O: Send>(
         &self,
-        pictures: &[FrameView],
+        views: &[FrameView],
         see: impl Fn([&Image; 2]) -> Result<O> + Sync,
     ) -> Result<Vec<O>> {
-        let mut found = Vec::with_capacity(pictures.len());
-        self.show(pictures, |views| {
+        let mut found = Vec::with_capacity(views.len());
+        self.show(views, |batch| {
             let compare_view = |view: &ViewStates<'_, 2>| {
                 let images = [0, 1].map(|subject| view.render(subject, self.background));
                 see([&images[0], &images[1]])
             };
-            found.extend(views.par_iter().map(compare_view).collect::<Result<Vec<O>>>()?);
+            found.extend(batch.par_iter().map(compare_view).collect::<Result<Vec<O>>>()?);
             Ok(())
         })?;
         Ok(found)
@@ -456,17 +456,11 @@ impl ModelPair {
         self.compressed.source().info().count
     }
 
-    /// Calls `visit` for all views `pictures`, in order, with a batch of views at a time. For each view of a batch,
-    /// `visit` gets the frame states of the original and of the compressed model.
-    fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
+    /// Calls `visit` for all `views`, in order, with a batch of views at a time. For each view of a batch, `visit` gets
+    /// the frame states of the original and of the compressed model.
+    fn show(&self, views: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all_gaussians);
-        for_each_view_batch(
-            subjects,
-            &self.scene.rig.cameras,
-            pictures,
-            BatchLimits::one_frame(&self.scene.limits),
-            visit,
-        )
+        for_each_view_batch(subjects, &self.scene.rig.cameras, views, BatchLimits::one_frame(&self.scene.limits), visit)
     }
 
     /// Renders and compares the views with the indices `range`. Returns the scores of these views, and the values of
@@ -482,8 +476,8 @@ impl ModelPair {
         let again = chosen.len();
         chosen.extend_from_slice(&self.views[range]);
         let mut last_frame: HashMap<u32, usize> = HashMap::new();
-        for picture in &chosen {
-            last_frame.insert(picture.view, picture.frame);
+        for view in &chosen {
+            last_frame.insert(view.view, view.frame);
         }
         let mut before: HashMap<u32, RenderedViews> = HashMap::new();
         let mut all = Vec::with_capacity(chosen.len() - again);
@@ -501,14 +495,14 @@ impl ModelPair {
                     if first + k < again {
                         return Ok((rendered, None));
                     }
-                    let scores = rendered.scores(before.get(&view.picture.view), self.flip);
+                    let scores = rendered.scores(before.get(&view.frame_view.view), self.flip);
                     let seen = observe(view.states[0], view.camera, &rendered);
                     progress.advance(1);
                     Ok((rendered, Some((scores, seen))))
                 })
                 .collect::<Result<_>>()?;
             for (shown, (rendered, found)) in views.iter().zip(rendered) {
-                let FrameView { frame, view, .. } = shown.picture;
+                let FrameView { frame, view, .. } = shown.frame_view;
                 if let Some((scores, seen)) = found {
                     all.push(scores);
                     observed.push(seen);
@@ -526,12 +520,12 @@ impl ModelPair {
 
     /// Renders a view with both models, and reads its photograph if there is one. Returns these images.
     fn render_view(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
-        let &ViewStates { picture, camera, .. } = view;
+        let &ViewStates { frame_view, camera, .. } = view;
         Ok(RenderedViews {
             original: view.render(0, self.background),
             compressed: view.render(1, self.background),
             truth: match &self.truth {
-                Some(truth) if truth.has(picture) => Some(truth.read(picture, camera, self.background)?),
+                Some(truth) if truth.has(frame_view) => Some(truth.read(frame_view, camera, self.background)?),
                 _ => None,
             },
         })
@@ -542,9 +536,8 @@ impl ModelPair {
 /// `range`, the last (frame, view) pair with this view number before the range. `all` has the pairs of all images,
 /// sorted by frame. `range` is the part of `all` that begins at the index `start`. The result has the order of `all`.
 fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
-    let mut views: HashSet<u32> = range.iter().map(|picture| picture.view).collect();
-    let mut last: Vec<FrameView> =
-        all[..start].iter().rev().filter(|picture| views.remove(&picture.view)).copied().collect();
+    let mut views: HashSet<u32> = range.iter().map(|view| view.view).collect();
+    let mut last: Vec<FrameView> = all[..start].iter().rev().filter(|view| views.remove(&view.view)).copied().collect();
     last.reverse();
     last
 }

@@ -28,7 +28,7 @@ pub struct PrecisionDiagram {
     #[serde(rename = "frames_looked_at")]
     pub frames_scored: usize,
     /// Number of views that are used to score and rank Gaussians, over all [`PrecisionDiagram::frames_scored`] frames.
-    pub pictures: usize,
+    pub views_scored: usize,
     /// Number of views on which settings are judged: in these views, renders of the Gaussians that a setting keeps are
     /// compared with renders of the whole model. They are test views, if there are any.
     pub judged: usize,
@@ -142,7 +142,7 @@ pub struct ObservedOrder {
 
 /// Name of the error: root mean square error of renders of the model that a setting yields, compared with renders of
 /// the whole model; color values are in [0, 1].
-pub const RENDER_ERROR: &str = "pictures";
+pub const RENDER_ERROR: &str = "renders";
 /// Name of the error that a setting adds to renders: √(e² − f²) / f (see [`added_error`]). Here e is the error
 /// [`RENDER_ERROR`] of the setting. f is the error [`RENDER_ERROR`] of the finest setting, which counts as the error of
 /// the compressed model itself.
@@ -319,7 +319,7 @@ impl PrecisionDiagram {
         let _ = writeln!(
             out,
             "{}: {} Gaussians x {} frames; scoring on {} views of {} frames, judged on {} views; {} kept",
-            self.path, self.gaussians, self.frames, self.pictures, self.frames_scored, self.judged, self.kept
+            self.path, self.gaussians, self.frames, self.views_scored, self.frames_scored, self.judged, self.kept
         );
         for (knob, curve) in self.curves() {
             let _ = writeln!(
@@ -386,7 +386,7 @@ mod tests {
         let curve = |added: &[f64]| {
             let marks =
                 added.iter().zip(1..).map(|(&added, k)| mark(f64::from(k), 1.0, &[(ADDED_ERROR, added)])).collect();
-            PrecisionCurve::new("pictures", "all", marks, Some(2.0), &[])
+            PrecisionCurve::new("views", "all", marks, Some(2.0), &[])
         };
         assert_eq!(curve(&[0.5, 0.05, 0.2, 0.09, 0.0]).sufficient_value, Some(4.0));
         assert_eq!(curve(&[0.5, 0.5]).sufficient_value, None);
@@ -428,7 +428,7 @@ mod tests {
             gaussians: 1,
             frames: 1,
             frames_scored: 1,
-            pictures: 1,
+            views_scored: 1,
             judged: 1,
             cameras: String::new(),
             kept: 1,

@@ -197,25 +197,25 @@ impl QualityMeans {
 }
 
 impl Comparison {
-    /// Averages scores over all `pictures`, over the frames of each view, and over the views of each frame. `pictures`
-    /// must be sorted by frame. `score` returns the score to average, or `None` to leave out this view at this frame.
-    /// Returns `None` if no score is left.
+    /// Averages scores over all `view_scores`, over the frames of each view, and over the views of each frame.
+    /// `view_scores` must be sorted by frame. `score` returns the score to average, or `None` to leave out this view at
+    /// this frame. Returns `None` if no score is left.
     pub fn from_views(
-        pictures: &[ViewScores],
+        view_scores: &[ViewScores],
         score: impl Fn(&ViewScores) -> Option<ImageScore>,
     ) -> Option<Comparison> {
-        let (pictures, scores): (Vec<&ViewScores>, Vec<ImageScore>) =
-            pictures.iter().filter_map(|picture| Some((picture, score(picture)?))).unzip();
+        let (view_scores, scores): (Vec<&ViewScores>, Vec<ImageScore>) =
+            view_scores.iter().filter_map(|view| Some((view, score(view)?))).unzip();
         if scores.is_empty() {
             return None;
         }
         let mut views: BTreeMap<u32, Vec<ImageScore>> = BTreeMap::new();
-        for (picture, &score) in pictures.iter().zip(&scores) {
-            views.entry(picture.view).or_default().push(score);
+        for (view, &score) in view_scores.iter().zip(&scores) {
+            views.entry(view.view).or_default().push(score);
         }
         let mut per_frame = Vec::new();
         let mut rest = &scores[..];
-        for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
+        for frame in view_scores.chunk_by(|a, b| a.frame == b.frame) {
             let (frame_scores, after) = rest.split_at(frame.len());
             per_frame.push(FrameMeans {
                 frame: frame[0].frame,
@@ -337,10 +337,10 @@ impl Evaluation {
             names.extend(["psnr", "ssim", "temporal"].map(|score| format!("{score}{suffix}")));
             names.extend(with_flip.then(|| format!("flip{suffix}")));
         }
-        let row = |picture: &ViewScores| {
-            let mut row = vec![picture.frame.to_string(), picture.view.to_string(), picture.time.to_string()];
-            let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
-            for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
+        let row = |view: &ViewScores| {
+            let mut row = vec![view.frame.to_string(), view.view.to_string(), view.time.to_string()];
+            let truth = view.truth.map(|truth| [truth.compressed, truth.original]);
+            for score in std::iter::once(view.loss).chain(truth.into_iter().flatten()) {
                 row.extend([score.psnr.to_string(), score.ssim.to_string(), optional_field(score.temporal)]);
                 row.extend(with_flip.then(|| optional_field(score.flip)));
             }
@@ -355,31 +355,31 @@ impl Evaluation {
 mod tests {
     use super::*;
 
-    fn picture(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> ViewScores {
+    fn view_scores(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> ViewScores {
         let loss = ImageScore { psnr, ssim: psnr / 100.0, temporal, flip: None };
         ViewScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
     }
 
     #[test]
     fn means_weigh_views_alike_and_skip_missing_temporal_errors() {
-        let pictures = [
-            picture(0, 1, 30.0, None),
-            picture(0, 2, 40.0, None),
-            picture(2, 1, 50.0, Some(0.25)),
-            picture(2, 7, 20.0, None),
-            picture(3, 1, 10.0, Some(0.75)),
+        let scores = [
+            view_scores(0, 1, 30.0, None),
+            view_scores(0, 2, 40.0, None),
+            view_scores(2, 1, 50.0, Some(0.25)),
+            view_scores(2, 7, 20.0, None),
+            view_scores(3, 1, 10.0, Some(0.75)),
         ];
-        let found = Comparison::from_views(&pictures, |picture| Some(picture.loss)).unwrap();
+        let found = Comparison::from_views(&scores, |view| Some(view.loss)).unwrap();
         assert_eq!(found.overall, QualityMeans { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
         let views: Vec<_> = found.per_view.iter().map(|v| (v.view, v.means.pairs, v.means.psnr)).collect();
         assert_eq!(views, [(1, 3, 30.0), (2, 1, 40.0), (7, 1, 20.0)]);
         let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();
         assert_eq!(frames, [(0, 35.0, None), (2, 35.0, Some(0.25)), (3, 10.0, Some(0.75))]);
-        assert!(Comparison::from_views(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
+        assert!(Comparison::from_views(&scores, |view| view.truth.map(|truth| truth.original)).is_none());
     }
 
-    fn evaluation(pictures: Vec<ViewScores>) -> Evaluation {
-        let truth = Comparison::from_views(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
+    fn evaluation(views: Vec<ViewScores>) -> Evaluation {
+        let truth = Comparison::from_views(&views, |view| view.truth.map(|truth| truth.compressed));
         Evaluation {
             tool: String::new(),
             path: OriginalAndCompressed { original: String::new(), compressed: String::new() },
@@ -388,7 +388,7 @@ mod tests {
             size: OriginalAndCompressed { original: ModelSize::default(), compressed: ModelSize::default() },
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
             background: [0.0; 3],
-            loss: Comparison::from_views(&pictures, |picture| Some(picture.loss)).unwrap(),
+            loss: Comparison::from_views(&views, |view| Some(view.loss)).unwrap(),
             rig_sides: None,
             ground_truth: truth.map(|comparison| TruthComparison {
                 folder: String::new(),
@@ -399,13 +399,13 @@ mod tests {
             render_ms: None,
             notes: Vec::new(),
             work_notes: Vec::new(),
-            views: pictures,
+            views,
         }
     }
 
     #[test]
     fn views_inside_and_outside_the_rig_are_averaged_separately() {
-        let views = [picture(0, 1, 30.0, None), picture(0, 2, 20.0, None), picture(1, 1, 40.0, None)];
+        let views = [view_scores(0, 1, 30.0, None), view_scores(0, 2, 20.0, None), view_scores(1, 1, 40.0, None)];
         let sides = InsideOutsideMeans::from_views(&views, &[false, true, false]).unwrap();
         assert_eq!((sides.inside.unwrap().psnr, sides.outside.psnr, sides.outside.pairs), (35.0, 20.0, 1));
         assert!(InsideOutsideMeans::from_views(&views, &[true; 3]).unwrap().inside.is_none());
@@ -419,20 +419,18 @@ mod tests {
 
     #[test]
     fn csv_matches_the_expected_text() {
-        let mut pictures = vec![picture(0, 1, 30.0, None), picture(3, 2, 3e-5, Some(0.25))];
+        let mut views = vec![view_scores(0, 1, 30.0, None), view_scores(3, 2, 3e-5, Some(0.25))];
         assert_eq!(
-            evaluation(pictures.clone()).csv(),
+            evaluation(views.clone()).csv(),
             "frame,view,time,psnr,ssim,temporal\n0,1,0,30,0.3,\n3,2,0.75,0.00003,0.0000003,0.25\n"
         );
-        for picture in &mut pictures {
-            picture.loss.flip = Some(0.5);
-            picture.truth = Some(OriginalAndCompressed {
-                original: ImageScore { flip: None, ..picture.loss },
-                compressed: picture.loss,
-            });
+        for view in &mut views {
+            view.loss.flip = Some(0.5);
+            view.truth =
+                Some(OriginalAndCompressed { original: ImageScore { flip: None, ..view.loss }, compressed: view.loss });
         }
         assert_eq!(
-            evaluation(pictures).csv(),
+            evaluation(views).csv(),
             "frame,view,time,psnr,ssim,temporal,flip,psnr_gt,ssim_gt,temporal_gt,flip_gt,\
              psnr_gt_original,ssim_gt_original,temporal_gt_original,flip_gt_original\n\
              0,1,0,30,0.3,,0.5,30,0.3,,0.5,30,0.3,,\n\

@@ -24,7 +24,7 @@ pub struct TradeOff {
     /// Number of threads that every measured run used.
     pub threads: usize,
     /// Number of (frame, view) pairs on which every result is compared with the original.
-    pub pictures: usize,
+    pub views: usize,
     /// File of the cameras, or description of the virtual rig (cameras that the program placed).
     pub cameras: String,
     /// Number of runs by which each point was measured; times are their medians.
@@ -130,7 +130,7 @@ impl TradeOff {
         let _ = writeln!(
             out,
             "{}: {} Gaussians, compared on {} views: {}",
-            self.path, self.gaussians, self.pictures, self.cameras
+            self.path, self.gaussians, self.views, self.cameras
         );
         let _ = writeln!(
             out,
@@ -209,7 +209,7 @@ mod tests {
             gaussians: 8,
             bytes: 0,
             threads: 1,
-            pictures: 1,
+            views: 1,
             cameras: String::new(),
             runs: 1,
             points: vec![point, own],

@@ -56,17 +56,16 @@ mod tests {
                 bits: BTreeMap::new(),
                 measured: vec![("a.b \"c\"".to_owned(), odd, 1.0, odd)],
             });
-            let (name, held_pictures) = ("min_psnr".to_owned(), vec!["t000_between".to_owned()]);
-            same(&GoalSummary { name, asked: 30.0, searched: odd, held: odd, held_pictures, tried: tried.clone() });
+            let (name, held_views) = ("min_psnr".to_owned(), vec!["t000_between".to_owned()]);
+            same(&GoalSummary { name, asked: 30.0, searched: odd, held: odd, held_views, tried: tried.clone() });
             let mut journal = Journal::default();
             journal.leave_out("a", "b");
             journal.leave_out_with_saving("c", "d", SavedCost::Stage { seconds: odd, reads: 2.0 });
             journal.leave_out_with_saving("e", "f", SavedCost::Values { bytes: 1 << 50 });
             journal.notes.push("several\nlines, 40.1 dB".to_owned());
-            journal.field =
-                Some(FieldSummary { half: true, pictures: 3, rounding: odd, result: Some(odd), least: odd });
-            journal.bands = Some(ShDegreeSummary { sh_degree: 2, pictures: 3, tried, result: odd, least: odd });
-            journal.refined = Some(RefinedSummary { pictures: 3, before: odd, result: odd });
+            journal.field = Some(FieldSummary { half: true, views: 3, rounding: odd, result: Some(odd), least: odd });
+            journal.bands = Some(ShDegreeSummary { sh_degree: 2, views: 3, tried, result: odd, least: odd });
+            journal.refined = Some(RefinedSummary { views: 3, before: odd, result: odd });
             let shown = format!("{journal:?}");
             assert_eq!(format!("{:?}", kept(journal)), shown);
         }

@@ -104,7 +104,7 @@ pub struct FieldSummary {
     /// Whether the deformation field is written in half precision.
     pub half: bool,
     /// Number of views on which renders were compared.
-    pub pictures: usize,
+    pub views: usize,
     /// Mean PSNR of renders with the half-precision deformation field, compared with renders with the exact field, dB.
     #[serde(deserialize_with = "number")]
     pub rounding: f64,
@@ -121,13 +121,13 @@ impl FieldSummary {
     /// Returns a text with the measured values that explain why the deformation field is or is not written in half
     /// precision.
     pub(crate) fn why(&self) -> String {
-        let FieldSummary { pictures, rounding, result, least, .. } = self;
+        let FieldSummary { views, rounding, result, least, .. } = self;
         let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
         let result = result.map_or(String::new(), |psnr| {
             format!(", {}", against(psnr, "of the result with the exact field against the original"))
         });
         format!(
-            "PSNR over {pictures} views: {}{result}; at least {least:.1} dB against the exact field required",
+            "PSNR over {views} views: {}{result}; at least {least:.1} dB against the exact field required",
             against(*rounding, "against the exact field")
         )
     }
@@ -137,7 +137,7 @@ impl FieldSummary {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RefinedSummary {
     /// Number of validation views, which are used to choose the best state but not to fit.
-    pub pictures: usize,
+    pub views: usize,
     /// Mean PSNR before refinement, against renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub before: f64,
@@ -209,7 +209,7 @@ pub struct ShDegreeSummary {
     /// SH degree of the output.
     pub sh_degree: usize,
     /// Number of views on which renders were compared.
-    pub pictures: usize,
+    pub views: usize,
     /// Lower SH degrees that were tried, each with the mean PSNR of its renders compared with renders with all degrees,
     /// dB.
     #[serde(deserialize_with = "sizes")]
@@ -226,11 +226,11 @@ pub struct ShDegreeSummary {
 impl ShDegreeSummary {
     /// Returns a text with the measured values that explain the SH degree of the output.
     pub(crate) fn why(&self) -> String {
-        let ShDegreeSummary { pictures, tried, result, least, .. } = self;
+        let ShDegreeSummary { views, tried, result, least, .. } = self;
         let line = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
         let tried: Vec<String> = tried.iter().map(line).collect();
         format!(
-            "PSNR over {pictures} views: {} against all degrees, {} of the result with all degrees against the \
+            "PSNR over {views} views: {} against all degrees, {} of the result with all degrees against the \
              original; at least {least:.1} dB against all degrees required",
             tried.join(", "),
             decibels_text(*result, 1)

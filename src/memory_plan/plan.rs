@@ -194,7 +194,7 @@ impl MemoryPlan {
             format_bytes(self.budget),
             work.gaussians,
             work.frames,
-            work.pictures,
+            work.frame_views,
             work.threads
         );
         let _ = writeln!(

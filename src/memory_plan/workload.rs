@@ -25,7 +25,7 @@ const PER_WRITTEN_FRAME: u64 = 16;
 /// sequence), and the number of Gaussians alive (opacity ≥ alpha_min) in the frame.
 const PER_FRAME: u64 = 8 + 8 + 8;
 /// Bytes of memory per view in a list of views.
-const PER_PICTURE: u64 = 24;
+const PER_LISTED_VIEW: u64 = 24;
 
 /// Bytes of memory per Gaussian while all threads render one view together: the projected Gaussians of each thread, and
 /// the same data joined into one list.
@@ -55,7 +55,7 @@ pub struct Workload {
     /// Number of views of the frame with the most views.
     pub views: u64,
     /// Total number of views over all frames.
-    pub pictures: u64,
+    pub frame_views: u64,
     /// Bytes of memory that the cameras and the list of their shots (views of the scene) take, see [`Rig::bytes`].
     pub rig: u64,
     /// Number of threads that share the work.
@@ -77,7 +77,7 @@ impl Workload {
             viewpoints: 0,
             pixels: 0,
             views: 0,
-            pictures: 0,
+            frame_views: 0,
             rig: 0,
             threads: rayon::current_num_threads() as u64,
             throughput: Throughput::UNKNOWN,
@@ -105,7 +105,7 @@ impl Workload {
             pixels: rig.cameras.iter().map(pixels).max().unwrap_or(0),
             views,
             viewpoints: numbers.len() as u64,
-            pictures: pairs,
+            frame_views: pairs,
             rig: rig.bytes(),
             ..self
         }
@@ -190,21 +190,21 @@ impl Workload {
         columns: Attributes,
         sums: u64,
     ) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
-        let pictures = self.threads.min(limits.views_together as u64);
+        let views_together = self.threads.min(limits.views_together as u64);
         let ready = VIEWS_PER_THREAD as u64 * self.threads;
         let per_gaussian = vec![
             ("states", ready.min(limits.frames_together as u64) * self.state_bytes(columns)),
             ("readers", self.input.reader),
             ("held", self.kept_frames_bytes(limits, columns)),
-            ("views", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
+            ("views", views_together * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
         ];
-        let buffers = pictures * (render::STRIP_BYTES as u64 + 12 * self.pixels);
+        let buffers = views_together * (render::STRIP_BYTES as u64 + 12 * self.pixels);
         (per_gaussian, vec![self.block_buffer_memory(), ("views", buffers)])
     }
 
-    /// Returns the memory that a list of `pictures` views takes: its name in the memory plan, and its bytes.
-    pub fn view_list_memory(pictures: f64) -> MemoryPart {
-        ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
+    /// Returns the memory that a list of `views` views takes: its name in the memory plan, and its bytes.
+    pub fn view_list_memory(views: f64) -> MemoryPart {
+        ("list", (PER_LISTED_VIEW as f64 * views).ceil() as u64)
     }
 
     /// Returns the memory of the buffers for writing the compressed model, as a container or as one file per frame.
@@ -250,15 +250,10 @@ impl Workload {
         shared * self.full_reads(frames, limits)
     }
 
-    /// Returns the time in seconds on one processor core for rendering `pictures` views of `gaussians` Gaussians. The
-    /// last argument, a [`RenderCost`], gives the time of one view per Gaussian and per pixel.
-    pub fn render_seconds(
-        &self,
-        pictures: f64,
-        gaussians: f64,
-        RenderCost { gaussian, pixel, pace }: RenderCost,
-    ) -> f64 {
-        pace(&self.throughput) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
+    /// Returns the time in seconds on one processor core for rendering `views` views of `gaussians` Gaussians. The last
+    /// argument, a [`RenderCost`], gives the time of one view per Gaussian and per pixel.
+    pub fn render_seconds(&self, views: f64, gaussians: f64, RenderCost { gaussian, pixel, pace }: RenderCost) -> f64 {
+        pace(&self.throughput) * views * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
     /// Returns a copy of this workload for renders of only every `stride`-th pixel in each direction, with the number

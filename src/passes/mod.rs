@@ -5,18 +5,17 @@ mod frames;
 mod gather;
 mod held;
 mod parts;
-pub(crate) mod pictures;
 mod sample;
 mod some_frames;
 mod states;
 mod tracks;
+pub(crate) mod views;
 
 pub use changed::SourceWithDeltas;
 pub use frames::FrameReaders;
 pub use gather::{BlockwiseReader, gather, gather_all};
 pub use held::FramesInMemory;
 pub use parts::BlockSlices;
-pub use pictures::{BatchLimits, RenderedSource, VIEWS_PER_THREAD, ViewStates, for_each_view_batch};
 pub use sample::{
     VIEWS_PER_FRAME, ViewSampler, frames_to_cover, pixel_stride, scoring_views, select_evenly,
     select_evenly_over_frames,
@@ -24,6 +23,7 @@ pub use sample::{
 pub use some_frames::SomeFrames;
 pub use states::FrameStates;
 pub use tracks::{TRACKS_PER_BLOCK, map_tracks};
+pub use views::{BatchLimits, RenderedSource, VIEWS_PER_THREAD, ViewStates, for_each_view_batch};
 
 /// Number of Gaussians per unit of parallel work: their attributes at one frame and the sums computed from them fit
 /// into the processor's caches. No result depends on this number.

@@ -62,7 +62,7 @@ impl ViewSampler {
         let mut left = ViewSchedule::default();
         for (frame, views) in schedule.iter().enumerate() {
             let taken: Vec<(u32, u32)> =
-                self.views_of_next_frame(frame, views).map(|picture| (picture.view, picture.camera)).collect();
+                self.views_of_next_frame(frame, views).map(|view| (view.view, view.camera)).collect();
             left.push_frames(1, &taken);
         }
         left
@@ -95,27 +95,27 @@ pub fn frames_to_cover(life: &[u32], frames: usize) -> usize {
     frames.div_ceil(shortest as usize)
 }
 
-/// Selects at most `pictures` views with [`select_evenly`], from at least `frames` frames if possible. Takes
+/// Selects at most `max_views` views with [`select_evenly`], from at least `frames` frames if possible. Takes
 /// [`VIEWS_PER_FRAME`] views of each frame that it uses, or fewer (at least one) if this is necessary to use `frames`
 /// frames.
-pub fn select_evenly_over_frames(schedule: &ViewSchedule, pictures: usize, frames: usize) -> Vec<FrameView> {
-    select_evenly(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
+pub fn select_evenly_over_frames(schedule: &ViewSchedule, max_views: usize, frames: usize) -> Vec<FrameView> {
+    select_evenly(schedule, max_views, (max_views / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
 }
 
-/// Selects at most `pictures` views, spread evenly over all frames and view numbers. Takes up to `views` views of each
-/// frame that it uses, so that it uses as few frames as possible (see [`VIEWS_PER_FRAME`]). Selects all views if
-/// `schedule` has no more than `pictures`.
-pub fn select_evenly(schedule: &ViewSchedule, pictures: usize, views: usize) -> Vec<FrameView> {
+/// Selects at most `max_views` views, spread evenly over all frames and view numbers. Takes up to `views_per_frame`
+/// views of each frame that it uses, so that it uses as few frames as possible (see [`VIEWS_PER_FRAME`]). Selects all
+/// views if `schedule` has no more than `max_views`.
+pub fn select_evenly(schedule: &ViewSchedule, max_views: usize, views_per_frame: usize) -> Vec<FrameView> {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
-    let pictures = pictures.min(schedule.pair_count());
-    let of_frame = schedule.pair_count().div_ceil(seen.max(1)).clamp(1, views.max(1));
-    let count = seen.min(pictures.div_ceil(of_frame));
-    let mut selected = Vec::with_capacity(pictures);
+    let view_count = max_views.min(schedule.pair_count());
+    let of_frame = schedule.pair_count().div_ceil(seen.max(1)).clamp(1, views_per_frame.max(1));
+    let count = seen.min(view_count.div_ceil(of_frame));
+    let mut selected = Vec::with_capacity(view_count);
     let mut frames = schedule.iter().enumerate().filter(|(_, views)| !views.is_empty()).enumerate();
     for k in 0..count {
         let wanted = (2 * k + 1) * seen / (2 * count);
         let Some((_, (frame, views))) = frames.find(|&(place, _)| place == wanted) else { break };
-        let wanted = (pictures * (k + 1) / count - pictures * k / count).min(views.len());
+        let wanted = (view_count * (k + 1) / count - view_count * k / count).min(views.len());
         // Starts at the view after the last one taken of the previous frame, so that all views are used in turn.
         let first = selected.len();
         let mut places: Vec<usize> = (0..wanted).map(|j| (first + j * views.len() / wanted) % views.len()).collect();
@@ -143,13 +143,13 @@ mod tests {
         schedule
     }
 
-    fn frames(pictures: &[FrameView]) -> usize {
-        pictures.chunk_by(|a, b| a.frame == b.frame).count()
+    fn frames(views: &[FrameView]) -> usize {
+        views.chunk_by(|a, b| a.frame == b.frame).count()
     }
 
     #[test]
     fn views_spread_over_frames_and_view_numbers() {
-        for (frame_count, views, pictures, at_once, expected) in [
+        for (frame_count, views, max_views, at_once, expected) in [
             (60, 13, 96, 3, (32, 96)),
             (60, 12, 24, 1, (24, 24)),
             (25, 1, 24, 1, (24, 24)),
@@ -158,15 +158,15 @@ mod tests {
             (1, 400, 96, 3, (1, 96)),
             (7, 5, usize::MAX, 3, (7, 35)),
         ] {
-            let selected = select_evenly(&schedule(frame_count, views), pictures, at_once);
+            let selected = select_evenly(&schedule(frame_count, views), max_views, at_once);
             assert_eq!(frames(&selected), expected.0, "{frame_count} frames of {views} views");
             assert_eq!(selected.len(), expected.1, "{frame_count} frames of {views} views");
-            let order = |picture: &FrameView| (picture.frame, picture.view);
+            let order = |view: &FrameView| (view.frame, view.view);
             assert!(
                 selected.windows(2).all(|pair| order(&pair[0]) < order(&pair[1])),
                 "{frame_count} frames of {views} views"
             );
-            let mut seen: Vec<u32> = selected.iter().map(|picture| picture.view).collect();
+            let mut seen: Vec<u32> = selected.iter().map(|view| view.view).collect();
             seen.sort_unstable();
             seen.dedup();
             assert_eq!(
@@ -184,12 +184,12 @@ mod tests {
         (0..50).for_each(|frame| gaps.push_frames(1, if frame % 3 == 0 { &[] } else { &[(0, 0), (1, 1)] }));
         let seen: Vec<usize> = (0..50).filter(|frame| frame % 3 > 0).collect();
         for count in [1, 2, 7, 16, 32, 33, 40] {
-            let selected: Vec<usize> = select_evenly(&gaps, count, 1).iter().map(|picture| picture.frame).collect();
+            let selected: Vec<usize> = select_evenly(&gaps, count, 1).iter().map(|view| view.frame).collect();
             let parts = count.min(seen.len());
             let expected = (0..parts).map(|k| seen[(2 * k + 1) * seen.len() / (2 * parts)]);
             let mut frames = selected.clone();
             frames.dedup();
-            assert_eq!(frames, expected.collect::<Vec<_>>(), "{count} pictures");
+            assert_eq!(frames, expected.collect::<Vec<_>>(), "{count} views");
             assert_eq!(selected.len(), count);
         }
     }
@@ -208,7 +208,7 @@ mod tests {
         assert_eq!([0, 1, 16, 17, 24, 25, 48, 300].map(frame_count), [16, 16, 16, 24, 24, 48, 48, 48]);
         // A Gaussian that is alive as long as 99% of the Gaussians are is alive in one of these frames.
         let seen: Vec<usize> =
-            select_evenly_over_frames(&schedule(300, 18), 48, 25).iter().map(|picture| picture.frame).collect();
+            select_evenly_over_frames(&schedule(300, 18), 48, 25).iter().map(|view| view.frame).collect();
         assert!((0..=288).all(|birth| seen.iter().any(|frame| (birth..birth + 12).contains(frame))));
     }
 
@@ -228,7 +228,7 @@ mod tests {
             [720, 180, 180, 100, 100]
         );
         let strided = taken(0, 4);
-        assert!(taken(100, 4).iter().all(|picture| strided.contains(picture)));
+        assert!(taken(100, 4).iter().all(|view| strided.contains(view)));
     }
 
     #[test]

@@ -233,7 +233,7 @@ pub(crate) mod tests {
             pixels: 320 * 240,
             views: 2,
             viewpoints: 2,
-            pictures: 1200,
+            frame_views: 1200,
             rig: 560,
             threads: 2,
             ..Workload::new(&info, MemoryProfile::for_tiles(FRAME_BLOCK as u64))

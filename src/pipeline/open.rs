@@ -302,9 +302,9 @@ impl<'a> Measuring<'a> {
         self.scan.add(held, &cameras)?;
         if let Some((sampler, seen)) = &mut self.seen {
             let new = new.iter().enumerate();
-            let pictures: Vec<FrameView> =
+            let views: Vec<FrameView> =
                 new.flat_map(|(frame, views)| sampler.views_of_next_frame(frame, views)).collect();
-            seen.add(held, self.cameras, &pictures, || ())?;
+            seen.add(held, self.cameras, &views, || ())?;
         }
         Ok(())
     }

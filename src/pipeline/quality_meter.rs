@@ -30,13 +30,13 @@ pub(super) struct QualityMeter<'a> {
     cameras: &'a [Camera],
     /// Views, in order of frames. Second element of each pair: whether the view is held back from the search for the
     /// smallest model, to report the quality.
-    pictures: Vec<(FrameView, bool)>,
+    views: Vec<(FrameView, bool)>,
     comparison: QualityReference<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
-    /// Creates a quality meter, which measures the PSNR of compressed models on the views `pictures` of `cameras`.
-    /// - `pictures`: views in the order of frames. Second element of each pair: whether the view is held back from the
+    /// Creates a quality meter, which measures the PSNR of compressed models on `views` of `cameras`.
+    /// - `views`: views in the order of frames. Second element of each pair: whether the view is held back from the
     ///   search for the smallest model, to report the quality.
     /// - `comparison`: images with which renders of the models are compared.
     ///
@@ -45,18 +45,18 @@ impl<'a> QualityMeter<'a> {
     pub(super) fn new(
         scene: &'a Scene,
         cameras: &'a [Camera],
-        pictures: Vec<(FrameView, bool)>,
+        views: Vec<(FrameView, bool)>,
         comparison: QualityReference<'a>,
     ) -> Result<QualityMeter<'a>> {
-        let held = pictures.iter().filter(|picture| picture.1).count();
-        if held == 0 || held == pictures.len() {
-            let found = pictures.len();
+        let held = views.iter().filter(|view| view.1).count();
+        if held == 0 || held == views.len() {
+            let found = views.len();
             return Err(Error::usage(format!(
                 "a search for a quality uses some views to search and others to report: expected 4 or more views, \
                  found {found}"
             )));
         }
-        Ok(QualityMeter { scene, cameras, pictures, comparison })
+        Ok(QualityMeter { scene, cameras, views, comparison })
     }
 
     /// Returns the mean PSNR, dB, of renders of the model `source` against the images of the meter (renders of the
@@ -67,33 +67,33 @@ impl<'a> QualityMeter<'a> {
     /// Fails if frames or photographs cannot be read.
     pub(super) fn measure(&self, source: &dyn FrameSource, held: bool) -> Result<f64> {
         let background = self.scene.background;
-        let places: Vec<usize> = (0..self.pictures.len()).filter(|&k| self.pictures[k].1 == held).collect();
-        let pictures: Vec<FrameView> = places.iter().map(|&k| self.pictures[k].0).collect();
-        let mut found = Vec::with_capacity(pictures.len());
+        let places: Vec<usize> = (0..self.views.len()).filter(|&k| self.views[k].1 == held).collect();
+        let views: Vec<FrameView> = places.iter().map(|&k| self.views[k].0).collect();
+        let mut found = Vec::with_capacity(views.len());
         for_each_view_batch(
             [RenderedSource::all_gaussians(source)],
             self.cameras,
-            &pictures,
+            &views,
             BatchLimits::one_frame(&self.scene.limits),
-            |views| {
+            |batch| {
                 let first = found.len();
                 let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
                     match &self.comparison {
                         QualityReference::Photographs(photographs) => {
-                            let picture = view.render(0, background);
-                            Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
+                            let image = view.render(0, background);
+                            Ok(psnr(&image, &photographs.read(view.frame_view, view.camera, background)?))
                         }
                         QualityReference::Original(targets, numbers) => {
                             // Must be rendered in the same way as the targets.
-                            let picture = render(view.states[0], view.camera, background);
+                            let image = render(view.states[0], view.camera, background);
                             Ok(decibels(mean_square(
-                                &picture,
+                                &image,
                                 &targets.values(numbers[places[first + place]], targets.stride())?,
                             )))
                         }
                     }
                 };
-                let of_batch: Vec<f64> = views.par_iter().enumerate().map(view_psnr).collect::<Result<_>>()?;
+                let of_batch: Vec<f64> = batch.par_iter().enumerate().map(view_psnr).collect::<Result<_>>()?;
                 found.extend(of_batch);
                 Ok(())
             },
@@ -104,17 +104,17 @@ impl<'a> QualityMeter<'a> {
     /// Returns the number of views on which the search for the smallest model compares models. Views that are held back
     /// from the search are not counted.
     pub(super) fn search_view_count(&self) -> usize {
-        self.pictures.iter().filter(|picture| !picture.1).count()
+        self.views.iter().filter(|view| !view.1).count()
     }
 
     /// Returns the names of the views that are held back from the search for the smallest model. A name has the form
     /// `tNNN_vNN` (frame, view number). A view from a camera between two cameras of the scene has no view number; its
     /// name is `tNNN_between`.
     pub(super) fn held_back_names(&self) -> Vec<String> {
-        let name = |picture: &FrameView| match picture.view {
-            u32::MAX => format!("t{:03}_between", picture.frame),
-            _ => picture.name(),
+        let name = |view: &FrameView| match view.view {
+            u32::MAX => format!("t{:03}_between", view.frame),
+            _ => view.name(),
         };
-        self.pictures.iter().filter(|picture| picture.1).map(|(picture, _)| name(picture)).collect()
+        self.views.iter().filter(|view| view.1).map(|(view, _)| name(view)).collect()
     }
 }

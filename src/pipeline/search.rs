@@ -74,7 +74,7 @@ pub struct SearchStage {
     searched: Quality,
     /// Number of target views (renders of the original model). Refinement fits models to some of them; the quality of
     /// the models is measured on others.
-    pictures: usize,
+    target_views: usize,
     /// Refinement stage, which is run at every size; `None` if nothing is refined.
     refine: Option<RefineStage>,
     /// Whether every tried model is also fitted to photographs, those in the folder of [`Quality::Loss`].
@@ -108,7 +108,7 @@ impl SearchStage {
         Some(SearchStage {
             quality: quality.clone(),
             searched,
-            pictures: request.recipe.refine.refine_target_views,
+            target_views: request.recipe.refine.refine_target_views,
             refine: planning.refine.clone(),
             fits_photographs: request.photographs.is_some(),
             margins: [field, bands],
@@ -132,7 +132,7 @@ impl SearchStage {
             stage: NAME,
             reads: work.scattered_full_reads(frames, limits),
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64)
-                + work.render_seconds(self.pictures as f64, work.gaussian_count(), RENDER_COST),
+                + work.render_seconds(self.target_views as f64, work.gaussian_count(), RENDER_COST),
             per_gaussian: [
                 scored_memory(limits),
                 vec![("states", whole), ("readers", reader), ("held", held), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)],
@@ -172,7 +172,7 @@ impl SearchStage {
             let photographs = self.photographs(scene)?;
             let (pixels, count) = (scene.workload().pixels, scored.gaussian_count());
             let stride = self.refine.as_ref().map_or(NonZeroU32::MIN, |refine| refine.stride(pixels, count));
-            let targets = Targets::new(scene, self.pictures, stride, photographs.is_none())?;
+            let targets = Targets::new(scene, self.target_views, stride, photographs.is_none())?;
             let parts = targets.split();
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());
@@ -236,7 +236,7 @@ impl SearchStage {
             None => {
                 let mut numbers = [&parts.validation[..], &parts.test[..]].concat();
                 numbers.sort_unstable();
-                let view = |&k: &usize| (targets.pictures[k], parts.test.contains(&k));
+                let view = |&k: &usize| (targets.views[k], parts.test.contains(&k));
                 let views = numbers.iter().map(view).collect();
                 QualityMeter::new(scene, &targets.cameras, views, QualityReference::Original(targets, numbers))
             }
@@ -255,7 +255,7 @@ impl SearchStage {
         }
         let refine = self.refine.as_ref().map(RefineStage::key);
         Ok(scene.work.key(&(
-            (asked, files, self.pictures, self.fits_photographs, self.margins[0], self.margins[1], refine),
+            (asked, files, self.target_views, self.fits_photographs, self.margins[0], self.margins[1], refine),
             &scored.protected,
             ranked,
             template,
@@ -386,23 +386,17 @@ impl SearchStage {
         }
     }
 
-    fn summary(
-        &self,
-        best: &TriedSize,
-        held: f64,
-        held_pictures: Vec<String>,
-        tried: Vec<(usize, f64)>,
-    ) -> GoalSummary {
+    fn summary(&self, best: &TriedSize, held: f64, held_views: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
         let asked = self.goal();
-        GoalSummary { name: self.name().to_owned(), asked, searched: best.value, held, held_pictures, tried }
+        GoalSummary { name: self.name().to_owned(), asked, searched: best.value, held, held_views, tried }
     }
 }
 
 /// Returns a note for display about the result of the search. `searched`: number of views that the search used.
 /// `gaussians`: number of Gaussians in the result. `is_met`: whether the result has the requested quality.
 fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) -> String {
-    let GoalSummary { name, asked, searched: by_searched, held, held_pictures, tried } = summary;
-    let (sizes, others) = (tried.len(), held_pictures.len());
+    let GoalSummary { name, asked, searched: by_searched, held, held_views, tried } = summary;
+    let (sizes, others) = (tried.len(), held_views.len());
     let (at, unit) = if name == "max_loss" { ("most", "dB loss against photographs") } else { ("least", "dB PSNR") };
     let found = match is_met {
         true => format!("{gaussians} Gaussians are the smallest of {sizes} tried sizes that reach this"),
@@ -410,6 +404,6 @@ fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) 
     };
     format!(
         "search for at {at} {asked} {unit}: {found}; {by_searched:.2} dB on the {searched} views of the search, \
-         {held:.2} dB on {others} other views (goal.held_pictures in the summary)"
+         {held:.2} dB on {others} other views (goal.held_views in the summary)"
     )
 }

@@ -39,7 +39,7 @@ pub struct GoalSummary {
     pub held: f64,
     /// Names of the views that the search did not use. A name consists of frame and view number; the name of a view
     /// from a camera between those of the scene has only the frame.
-    pub held_pictures: Vec<String>,
+    pub held_views: Vec<String>,
     /// Every number of Gaussians that was tried, with the quality of its model on the views that the search used, dB:
     /// PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "sizes")]

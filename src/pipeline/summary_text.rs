@@ -114,7 +114,7 @@ impl Summary {
         }
         if let Some(goal) = &self.goal {
             let of = if goal.name == "max_loss" { "loss against photographs" } else { "PSNR vs. original" };
-            let views = goal.held_pictures.len();
+            let views = goal.held_views.len();
             writeln!(
                 out,
                 "{:<14}  {} dB {of} asked for, {:.2} dB on {} apart from the search",

@@ -96,14 +96,14 @@ impl Calibration {
         };
         let work = Workload { throughput: machine, ..work };
         let views_per_way = VIEWS_PER_THREAD as f64 * work.threads as f64;
-        let pictures = [CONTRIBUTION_COST, REMOVAL_COST, RENDER_COST]
+        let render_seconds = [CONTRIBUTION_COST, REMOVAL_COST, RENDER_COST]
             .map(|way| work.render_seconds(views_per_way, work.gaussian_count(), way));
         let needed_seconds = work.reading_seconds(work.gaussian_count(), work.input.frame_block.max(1) as f64)
-            + pictures.iter().sum::<f64>()
-            + pictures[2];
+            + render_seconds.iter().sum::<f64>()
+            + render_seconds[2];
         let mut found = Calibration { pace: machine, hardly_seen: 0.0 };
-        if needed_seconds <= budget && work.pictures > 0 {
-            found.render_views(scene, pictures, &mut spent)?;
+        if needed_seconds <= budget && work.frame_views > 0 {
+            found.render_views(scene, render_seconds, &mut spent)?;
         }
         found.pace.processors = spent.processors(work.threads);
         Ok(found)
@@ -251,7 +251,7 @@ mod tests {
             found.pace.states > 0.0 && found.pace.contribution_time > 0.0 && found.pace.removal_time > 0.0,
             "{found:?}"
         );
-        assert_ne!(found.pace.contribution_time, found.pace.states, "pictures were made");
+        assert_ne!(found.pace.contribution_time, found.pace.states, "views were rendered");
         let short = Calibration::measure(&scene, 1e-6).unwrap();
         assert_eq!((short.pace.contribution_time, short.hardly_seen), (short.pace.states, 0.0));
         assert_eq!(scene.workload(), before);

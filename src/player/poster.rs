@@ -36,12 +36,12 @@ pub fn render_poster(
     let away = |frame: &usize| shot.time.map_or(0.0, |time| (times[*frame] - time).abs());
     let Some(frame) = (0..times.len()).min_by(|a, b| away(a).total_cmp(&away(b))) else { return Ok(None) };
     let camera = smaller(&rig.cameras[shot.camera as usize]);
-    let picture = FrameView { frame, view: shot.view, camera: 0 };
+    let frame_view = FrameView { frame, view: shot.view, camera: 0 };
     let mut uri = None;
     for_each_view_batch(
         [RenderedSource::all_gaussians(source)],
         &[camera],
-        &[picture],
+        &[frame_view],
         BatchLimits::one_frame(limits),
         |views| {
             for view in views {

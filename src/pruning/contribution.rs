@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, FrameView};
-use crate::passes::pictures::{RenderedSource, Workers};
+use crate::passes::views::{RenderedSource, Workers};
 use crate::progress::Events;
 use crate::render::{Contribution, Renderer};
 use crate::source::{FrameSource, Ids};
@@ -32,18 +32,18 @@ pub struct VisibleContribution {
 
 impl VisibleContribution {
     /// Converts the sums and maxima in `found` to contributions C (mean per view, pixels) and peaks W (largest weight
-    /// in a pixel), and returns these. `pictures`: number of views that were rendered; only every `pixel_stride`-th
+    /// in a pixel), and returns these. `view_count`: number of views that were rendered; only every `pixel_stride`-th
     /// column and row of their pixels was rendered.
-    pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
+    pub fn new(found: &Contribution, view_count: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
-        let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / pictures.max(1) as f64).collect();
+        let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / view_count.max(1) as f64).collect();
         VisibleContribution { coverage, peak: found.max.iter().map(|&max| f64::from(max)).collect() }
     }
 }
 
-/// Renders the views `pictures` and returns the contribution of every Gaussian, summed over the views. Only every
-/// `pixel_stride`-th column and row of pixels is rendered. [`VisibleContribution::new`] converts the result to C (mean
-/// contribution per view) and W (largest weight in a pixel).
+/// Renders `views` and returns the contribution of every Gaussian, summed over the views. Only every `pixel_stride`-th
+/// column and row of pixels is rendered. [`VisibleContribution::new`] converts the result to C (mean contribution per
+/// view) and W (largest weight in a pixel).
 ///
 /// A Gaussian with NaN or infinity in a frame adds nothing in this frame, and a view without pixels adds nothing.
 /// Without views all results are zero. Fails if a frame cannot be read.
@@ -52,14 +52,14 @@ impl VisibleContribution {
 /// with the number of frames or views.
 pub fn visible_contribution(
     source: &dyn FrameSource,
-    (cameras, pictures): (&[Camera], &[FrameView]),
+    (cameras, views): (&[Camera], &[FrameView]),
     pixel_stride: NonZeroU32,
     limits: Limits,
     events: &Events,
 ) -> Result<Contribution> {
-    let progress = events.task("visible", "views", pictures.len() as u64);
+    let progress = events.task("visible", "views", views.len() as u64);
     let mut running = RunningContribution::new(source.info().count, pixel_stride, limits);
-    running.add(source, cameras, pictures, || progress.advance(1))?;
+    running.add(source, cameras, views, || progress.advance(1))?;
     Ok(running.sum())
 }
 
@@ -73,7 +73,7 @@ pub fn visible_contribution(
 pub struct RunningContribution {
     count: usize,
     pixel_stride: NonZeroU32,
-    pictures: usize,
+    view_count: usize,
     workers: Workers<(Renderer, Contribution)>,
 }
 
@@ -81,25 +81,25 @@ impl RunningContribution {
     /// Creates the sums for `count` Gaussians, all 0. Only every `pixel_stride`-th column and row of pixels of the
     /// views will be rendered.
     pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
-        RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
+        RunningContribution { count, pixel_stride, view_count: 0, workers: Workers::new(limits) }
     }
 
-    /// Renders the views `pictures` (frames of `source` seen by `cameras`), in the order of frames, and adds the
-    /// contributions of the Gaussians to the sums. Every call must pass a source of the same Gaussians. Calls `advance`
-    /// after each view. Fails if a frame cannot be read.
+    /// Renders `views` (frames of `source` seen by `cameras`), in the order of frames, and adds the contributions of
+    /// the Gaussians to the sums. Every call must pass a source of the same Gaussians. Calls `advance` after each view.
+    /// Fails if a frame cannot be read.
     pub fn add(
         &mut self,
         source: &dyn FrameSource,
         cameras: &[Camera],
-        pictures: &[FrameView],
+        views: &[FrameView],
         advance: impl Fn() + Sync,
     ) -> Result<()> {
         let (count, pixel_stride) = (self.count, self.pixel_stride);
-        self.pictures += pictures.len();
+        self.view_count += views.len();
         self.workers.for_each_view(
             RenderedSource { source, ids: Some(Ids::Range(0..count)), columns: GEOMETRY },
             cameras,
-            pictures,
+            views,
             || (Renderer::new(), Contribution::new(count)),
             |(renderer, seen), state, camera| {
                 renderer.contribution(state, camera, pixel_stride, seen);
@@ -111,8 +111,8 @@ impl RunningContribution {
     /// Returns two values of every Gaussian over all views added so far: its contribution C (Σ alpha · transmittance
     /// over the pixels of a view, averaged over the views) and its peak W (largest alpha · transmittance in one pixel).
     pub fn finish(self) -> VisibleContribution {
-        let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
-        VisibleContribution::new(&self.sum(), pictures, pixel_stride)
+        let (view_count, pixel_stride) = (self.view_count, self.pixel_stride);
+        VisibleContribution::new(&self.sum(), view_count, pixel_stride)
     }
 
     fn sum(self) -> Contribution {
@@ -156,19 +156,19 @@ mod tests {
         for (pixel, view, frame) in [(1, 1, 1), (3, 2, 2)] {
             let scan = strides(pixel, view, frame);
             let mut plain = Contribution::new(2500);
-            let mut pictures = 0;
+            let mut view_count = 0;
             for (frame_index, t) in (0..7).step_by(frame as usize).enumerate() {
                 let mut state = Gaussians::zeros(2500, scene.info().sh_degree);
                 scene.open(Ids::Range(0..2500)).unwrap().read(t, Attributes::all(), &mut state).unwrap();
                 for &(_, camera) in schedule.views(t).iter().skip(frame_index % view as usize).step_by(view as usize) {
                     let camera = &schedule.cameras[camera as usize];
                     render::contribution(&state, camera, scan.pixel_stride, &mut plain);
-                    pictures += 1;
+                    view_count += 1;
                 }
             }
             let sample = scoring_views(&schedule, &scan, 1);
             let frames = sample.chunk_by(|a, b| a.frame == b.frame).count();
-            assert_eq!((sample.len(), frames), (pictures, 7usize.div_ceil(frame as usize)));
+            assert_eq!((sample.len(), frames), (view_count, 7usize.div_ceil(frame as usize)));
             let one = Limits { max_kept_frames: 1, frames_together: 1, views_together: 1, ..Limits::NONE };
             for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
                 let look = || {
@@ -183,7 +183,7 @@ mod tests {
                 };
                 let seen = VisibleContribution::new(&on_threads(threads, look), sample.len(), scan.pixel_stride);
                 for i in 0..2500 {
-                    let expected = plain.in_pixels(i) * f64::from(pixel * pixel) / pictures as f64;
+                    let expected = plain.in_pixels(i) * f64::from(pixel * pixel) / view_count as f64;
                     assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
                     assert_eq!(seen.peak[i], f64::from(plain.max[i]), "W of {i} on {threads} threads");
                 }
@@ -217,7 +217,7 @@ mod tests {
         }
         let taken = |view, frame| -> Vec<(usize, u32)> {
             let sample = scoring_views(&schedule, &strides(1, view, frame), 1);
-            sample.iter().map(|picture| (picture.frame, picture.camera)).collect()
+            sample.iter().map(|frame_view| (frame_view.frame, frame_view.camera)).collect()
         };
         assert_eq!(taken(3, 1), [(1, 0), (2, 1), (4, 2), (5, 0)]);
         assert_eq!(taken(2, 2), [(1, 0), (1, 2), (4, 1)]);

@@ -6,8 +6,8 @@ use std::num::NonZeroU32;
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, FrameView};
-use crate::passes::pictures::{RenderedSource, Workers};
 use crate::passes::pixel_stride;
+use crate::passes::views::{RenderedSource, Workers};
 use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
@@ -22,9 +22,9 @@ pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
 }
 
 /// Renders only the Gaussians `ids` and returns for each of them the [`RemovalError`], the squared error that removing
-/// it would cause, summed over the views `pictures`. Only every `stride`-th column and row of pixels is rendered. The
-/// square of `contrast_floor` is added to each squared color difference ([`RemovalError::contrast_floor`]). Calls
-/// `advance` after each view. The result does not depend on the number of threads. Fails if a frame cannot be read.
+/// it would cause, summed over `views`. Only every `stride`-th column and row of pixels is rendered. The square of
+/// `contrast_floor` is added to each squared color difference ([`RemovalError::contrast_floor`]). Calls `advance` after
+/// each view. The result does not depend on the number of threads. Fails if a frame cannot be read.
 ///
 /// Memory per Gaussian of `ids`, where d is the SH degree and a state has 44 + 12·(d + 1)² bytes:
 /// - the memory of the reader of `source`, per Gaussian;
@@ -37,7 +37,7 @@ pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],
-    (cameras, pictures): (&[Camera], &[FrameView]),
+    (cameras, views): (&[Camera], &[FrameView]),
     background: [f32; 3],
     (contrast_floor, stride): (f32, NonZeroU32),
     limits: Limits,
@@ -47,7 +47,7 @@ pub fn removal_error(
     workers.for_each_view(
         RenderedSource { source, ids: Some(Ids::List(ids)), columns: Attributes::all() },
         cameras,
-        pictures,
+        views,
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
         |(renderer, errors), state, camera| {
             renderer.removal_error(state, PixelGrid::centered(stride).sampled_view(camera), background, errors);

@@ -51,7 +51,7 @@ impl VisibilityStage {
         let (mut per_gaussian, mut fixed) =
             work.view_pass_memory(limits, Attributes::all().difference(Attributes::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
-        let strided = work.pictures as f64 / every;
+        let strided = work.frame_views as f64 / every;
         let max_views = match self.recipe.scoring_views {
             0 => f64::INFINITY,
             max_views => max_views as f64,
@@ -94,20 +94,20 @@ impl VisibilityStage {
         let source = scene.source();
         let count = source.info().count;
         let frames = frames_to_cover(life, source.info().times.len());
-        let pictures = scoring_views(&scene.schedule, &self.recipe, frames);
+        let views = scoring_views(&scene.schedule, &self.recipe, frames);
         let stride = self.pixel_stride(scene.workload().pixels, count);
         let cameras = &scene.schedule.cameras[..];
         let look = |range: Range<usize>| {
-            visible_contribution(source, (cameras, &pictures[range]), stride, scene.limits, &scene.events)
+            visible_contribution(source, (cameras, &views[range]), stride, scene.limits, &scene.events)
         };
         let seen: Result<VisibleContribution> = journal.run_stage(NAME, count, source, |_| {
-            let key = scene.work.key(&(&pictures, stride));
-            let found = scene.work.compute_in_shards(NAME, key, pictures.len(), look, |parts| {
+            let key = scene.work.key(&(&views, stride));
+            let found = scene.work.compute_in_shards(NAME, key, views.len(), look, |parts| {
                 let mut sum = Contribution::new(count);
                 for fraction in parts {
                     sum.merge(&fraction?);
                 }
-                Ok(VisibleContribution::new(&sum, pictures.len(), stride))
+                Ok(VisibleContribution::new(&sum, views.len(), stride))
             })?;
             Ok((found, count))
         });

@@ -35,12 +35,12 @@ pub(super) struct RenderQuality {
 }
 
 impl Loss {
-    /// Returns the derivative of the loss with respect to each color value of the render `picture`, as an image.
-    /// Derivatives are multiplied by the number of color values and by a constant; Adam does not depend on a constant
-    /// factor. `target`: color values of the target view, 0 to 1 as 16-bit integers. For values of the render outside
-    /// [0, 1] the derivative is 0, because a screen clamps these.
-    pub(super) fn slope(&self, picture: &Image, target: &[u16]) -> Image {
-        let mut slope = picture.clone();
+    /// Returns the derivative of the loss with respect to each color value of `render`, as an image. Derivatives are
+    /// multiplied by the number of color values and by a constant; Adam does not depend on a constant factor. `target`:
+    /// color values of the target view, 0 to 1 as 16-bit integers. For values of the render outside [0, 1] the
+    /// derivative is 0, because a screen clamps these.
+    pub(super) fn slope(&self, render: &Image, target: &[u16]) -> Image {
+        let mut slope = render.clone();
         for (value, &wanted) in slope.data.iter_mut().zip(target) {
             let shown = value.clamp(0.0, 1.0);
             *value = if shown == *value { 2.0 * (shown - wide(wanted)) } else { 0.0 };
@@ -48,7 +48,7 @@ impl Loss {
         if self.ssim > 0.0 {
             let count = target.len() as f64;
             let factors = [(1.0 - self.ssim) * SQUARED_WEIGHT, self.ssim * count].map(|factor| factor as f32);
-            let like = ssim_gradient(picture, &image(picture, target));
+            let like = ssim_gradient(render, &image(render, target));
             slope.data.iter_mut().zip(&like.data).for_each(|(to, like)| *to = factors[0] * *to - factors[1] * like);
         }
         slope
@@ -64,11 +64,11 @@ impl Loss {
         }
     }
 
-    /// Returns two errors of the render `picture` against the 16-bit values `target` of its target view: the mean
-    /// square error, and 1 − SSIM, which is 0 if SSIM is not part of the loss.
-    pub(super) fn errors(&self, picture: &Image, target: &[u16]) -> [f64; 2] {
-        let dissimilarity = if self.ssim > 0.0 { 1.0 - ssim(picture, &image(picture, target)) } else { 0.0 };
-        [mean_square(picture, target), dissimilarity]
+    /// Returns two errors of `render` against the 16-bit values `target` of its target view: the mean square error, and
+    /// 1 − SSIM, which is 0 if SSIM is not part of the loss.
+    pub(super) fn errors(&self, render: &Image, target: &[u16]) -> [f64; 2] {
+        let dissimilarity = if self.ssim > 0.0 { 1.0 - ssim(render, &image(render, target)) } else { 0.0 };
+        [mean_square(render, target), dissimilarity]
     }
 
     /// Returns the bytes of memory, per pixel of a view, that buffers for SSIM take if `threads` renders are compared
@@ -95,10 +95,10 @@ impl RenderQuality {
         10f64.powf(-self.psnr / 20.0)
     }
 
-    /// Returns the mean quality of several views. `pictures` holds for each view two errors: the mean square error, and
-    /// 1 − SSIM (result of [`Loss::errors`]).
-    pub(super) fn from_errors(pictures: &[[f64; 2]]) -> RenderQuality {
-        let mean = |of: &dyn Fn(&[f64; 2]) -> f64| pictures.iter().map(of).sum::<f64>() / pictures.len().max(1) as f64;
+    /// Returns the mean quality of several views. `errors` holds two errors of each view, as [`Loss::errors`] returns
+    /// them: the mean square error, and 1 − SSIM.
+    pub(super) fn from_errors(errors: &[[f64; 2]]) -> RenderQuality {
+        let mean = |of: &dyn Fn(&[f64; 2]) -> f64| errors.iter().map(of).sum::<f64>() / errors.len().max(1) as f64;
         RenderQuality {
             psnr: mean(&|&[square, _]| decibels(square)),
             error: mean(&|&[square, _]| square).sqrt(),
@@ -107,9 +107,9 @@ impl RenderQuality {
     }
 }
 
-/// Returns the target view `target`, given as 16-bit color values, as an image of the width and height of `picture`.
-fn image(picture: &Image, target: &[u16]) -> Image {
-    Image { data: target.iter().copied().map(wide).collect(), ..*picture }
+/// Returns the target view `target`, given as 16-bit color values, as an image of the width and height of `render`.
+fn image(render: &Image, target: &[u16]) -> Image {
+    Image { data: target.iter().copied().map(wide).collect(), ..*render }
 }
 
 #[cfg(test)]
@@ -125,25 +125,25 @@ mod tests {
         };
         let image = |data: Vec<f32>| Image { width: width as u32, height: height as u32, data };
         let target = narrow(&image(values(0.618, 0.1, 0.8)));
-        let picture = image(values(0.414, -0.1, 1.2));
-        let count = picture.data.len() as f64;
+        let render = image(values(0.414, -0.1, 1.2));
+        let count = render.data.len() as f64;
         for ssim in [0.0, 0.5, 1.0] {
             let loss = Loss { ssim };
-            let slopes = loss.slope(&picture, &target).data;
+            let slopes = loss.slope(&render, &target).data;
             // Without SSIM the squared error is not scaled.
             let squared = if ssim > 0.0 { (1.0 - ssim) * SQUARED_WEIGHT } else { 1.0 };
             let at = |k: usize, by: f32| {
-                let mut moved = picture.clone();
+                let mut moved = render.clone();
                 moved.data[k] += by;
                 let [square, dissimilarity] = loss.errors(&moved, &target);
                 count * (squared * square + ssim * dissimilarity)
             };
             // Skips values near 0 and 1, where the loss has a kink, so that a finite difference is the derivative on
             // neither side.
-            let clear = |k: &usize| [0.0, 1.0].iter().all(|end| (picture.data[*k] - end).abs() > 2e-3);
-            for k in (0..picture.data.len()).step_by(7).filter(clear) {
+            let clear = |k: &usize| [0.0, 1.0].iter().all(|end| (render.data[*k] - end).abs() > 2e-3);
+            for k in (0..render.data.len()).step_by(7).filter(clear) {
                 let expected =
-                    if (0.0..=1.0).contains(&picture.data[k]) { (at(k, 2e-3) - at(k, -2e-3)) / 4e-3 } else { 0.0 };
+                    if (0.0..=1.0).contains(&render.data[k]) { (at(k, 2e-3) - at(k, -2e-3)) / 4e-3 } else { 0.0 };
                 let got = f64::from(slopes[k]);
                 assert!(
                     (got - expected).abs() < 0.02 * expected.abs() + 0.02,

@@ -83,7 +83,7 @@ pub struct RefineStage {
     /// smaller number while many Gaussians are left.
     pub steps_per_prune: usize,
     /// Maximum number of target views (renders of the original that the Gaussians are fitted to).
-    pub pictures: usize,
+    pub target_views: usize,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub prunes: bool,
     /// Constant c of the removal errors by which Gaussians are ranked for a prune step: c² is added to each squared
@@ -119,7 +119,7 @@ impl RefineStage {
             loss: Loss { ssim: refine_ssim },
             steps: refine_steps as usize,
             steps_per_prune: refine_steps_per_prune as usize,
-            pictures: refine_target_views,
+            target_views: refine_target_views,
             prunes,
             contrast_floor: recipe.select.contrast_floor,
             keyframes: refine_keyframes,
@@ -154,7 +154,7 @@ impl RefineStage {
 
     /// Returns the cache key of the parameters of this stage. It does not depend on the input.
     pub(crate) fn key(&self) -> CacheKey {
-        let step_settings = (self.steps, self.steps_per_prune, self.pictures, self.prunes, self.keyframes);
+        let step_settings = (self.steps, self.steps_per_prune, self.target_views, self.prunes, self.keyframes);
         CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, step_settings))
     }
 
@@ -218,7 +218,7 @@ impl RefineStage {
     /// Estimates the memory and time that this stage needs for the input `work`: frame states, the optimizer, and a
     /// view with its gradient.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        self.estimate_for_views(work, limits, targets::view_counts(self.pictures, work.pixels))
+        self.estimate_for_views(work, limits, targets::view_counts(self.target_views, work.pixels))
     }
 
     /// Estimates memory and time as [`RefineStage::resource_estimate`] does, for `own` target views from the scene's
@@ -263,12 +263,12 @@ impl RefineStage {
         let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
         let stages = [Some(original), Some(phase(wanted.max(MIN_START_FRACTION), None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
-        let (pictures, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
+        let (target_views, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let prune_counts =
             prune_counts(self.initial_count((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted) + if keyframe_count > 0 { along_time(self.last_steps(wanted)) } else { 0 };
-        let validation_renders = pictures / targets::validation_every(own + between) as f64 * 4.0;
+        let validation_renders = target_views / targets::validation_every(own + between) as f64 * 4.0;
         let seconds = |(k, &size): (usize, &usize)| {
             let (count, left) = (size as f64 / 1e6 * work.gaussian_count(), (wanted * 1e6) as usize);
             let (steps, renders, ranked) = match k + 1 == prune_counts.len() {
@@ -293,7 +293,7 @@ impl RefineStage {
             stage: NAME,
             reads: 2.0 * work.scattered_full_reads(frames, limits),
             seconds: 2.0 * work.reading_seconds(work.gaussian_count(), frames as f64)
-                + stored.render_seconds(pictures, work.gaussian_count(), RENDER_COST)
+                + stored.render_seconds(target_views, work.gaussian_count(), RENDER_COST)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),
             per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![

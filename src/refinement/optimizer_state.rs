@@ -119,7 +119,7 @@ impl<'a> OptimizerState<'a> {
         StepParams { columns, sh_degree, loss }: StepParams,
         fixed: Vec<bool>,
     ) -> Result<OptimizerState<'a>> {
-        let mut frames: Vec<usize> = targets.pictures.iter().map(|picture| picture.frame).collect();
+        let mut frames: Vec<usize> = targets.views.iter().map(|view| view.frame).collect();
         frames.dedup();
         let deformation = result.deformation();
         let SequenceInfo { varying, sh_degree: state_degree, .. } = *result.info();
@@ -379,7 +379,7 @@ impl<'a> OptimizerState<'a> {
 
     /// Returns the index in `self.frames` of the frame of target view `k`.
     fn frame_index(&self, k: usize) -> usize {
-        self.frames.binary_search(&self.targets.pictures[k].frame).unwrap_or_default()
+        self.frames.binary_search(&self.targets.views[k].frame).unwrap_or_default()
     }
 
     /// Makes one optimization step of the constant delta (change of the stored parameters), on target view `k` with the
@@ -429,7 +429,7 @@ impl<'a> OptimizerState<'a> {
         let StepParams { columns, sh_degree, loss } = self.step_params;
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
-        let pull = |picture: &_| (0.0, loss.slope(picture, &target));
+        let pull = |render: &_| (0.0, loss.slope(render, &target));
         self.renderer.gradient(&now.state, view, self.scene.background, pull, gradients);
         now.jacobian.pull_back(gradients);
         if let Some((present, gradients)) = now.present.as_ref().zip(sparse) {
@@ -447,8 +447,8 @@ impl<'a> OptimizerState<'a> {
         let errors = |(renderer, now): &mut (Renderer, LinearizedState), &k: &usize| {
             self.compute_state(self.frame_index(k), now)?;
             let (view, values) = (self.targets.view(k, self.stride), self.targets.values(k, self.stride)?);
-            let picture = renderer.render(&now.state, view, self.scene.background);
-            Ok(self.step_params.loss.errors(&picture, &values))
+            let image = renderer.render(&now.state, view, self.scene.background);
+            Ok(self.step_params.loss.errors(&image, &values))
         };
         let losses: Vec<[f64; 2]> = views.par_iter().map_init(|| self.new_worker(), errors).collect::<Result<_>>()?;
         Ok(RenderQuality::from_errors(&losses))

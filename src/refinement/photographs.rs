@@ -46,13 +46,13 @@ impl RefineStage {
             return Err(Error::input(folder, "", expected, format!("{} of them", found.len())));
         }
         let schedule = ViewSchedule::from_views(scene.schedule.cameras.clone(), &found);
-        let [count, _] = photograph_counts(self.pictures, scene.workload().pixels);
+        let [count, _] = photograph_counts(self.target_views, scene.workload().pixels);
         Ok((select_evenly(&schedule, count, VIEWS_PER_FRAME), photographs))
     }
 
     /// Estimates the memory and time of the fit to photographs for the input `work`.
     pub(crate) fn photographs_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let mut need = self.estimate_for_views(work, limits, photograph_counts(self.pictures, work.pixels));
+        let mut need = self.estimate_for_views(work, limits, photograph_counts(self.target_views, work.pixels));
         need.stage = NAME;
         need.fixed.push(("photographs", work.threads * DECODE_BYTES_PER_PIXEL * work.pixels));
         need

@@ -74,7 +74,7 @@ impl RefineStage {
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, count, scene.source(), |journal| {
                 let targets =
-                    Targets::new(scene, self.pictures, self.stored_stride(scene.workload().pixels, count), false)?;
+                    Targets::new(scene, self.target_views, self.stored_stride(scene.workload().pixels, count), false)?;
                 scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.split());
                 Ok((run.run_all(&reduction, wanted, steps, journal)?.0, wanted))
@@ -108,7 +108,7 @@ impl RefineStage {
 
 /// Random order in which training views are used. Each epoch takes all of them once, in a new order.
 struct EpochSampler {
-    pictures: Vec<usize>,
+    views: Vec<usize>,
     at: usize,
     random: SplitMix64,
     /// Number of views taken from the random order so far, over all epochs.
@@ -116,18 +116,18 @@ struct EpochSampler {
 }
 
 impl EpochSampler {
-    fn new(pictures: Vec<usize>) -> EpochSampler {
-        EpochSampler { at: pictures.len(), pictures, random: SplitMix64(1), taken: 0 }
+    fn new(views: Vec<usize>) -> EpochSampler {
+        EpochSampler { at: views.len(), views, random: SplitMix64(1), taken: 0 }
     }
 
     fn next(&mut self) -> usize {
-        if self.at == self.pictures.len() {
-            self.random.shuffle(&mut self.pictures);
+        if self.at == self.views.len() {
+            self.random.shuffle(&mut self.views);
             self.at = 0;
         }
         self.at += 1;
         self.taken += 1;
-        self.pictures[self.at - 1]
+        self.views[self.at - 1]
     }
 
     /// Skips views of the random order until `taken` views have been taken since the beginning. Used to continue an
@@ -514,7 +514,7 @@ impl<'a> RefineRun<'a> {
         let [start, best] = [best_state.before.psnr, best_state.best.psnr];
         if self.refine.loss.is_closer(&best_state.best, &best_state.before) {
             journal.notes.push(format!("refinement: validation PSNR {start:.2} → {best:.2} dB ({count} views)"));
-            journal.refined = Some(RefinedSummary { pictures: count, before: start, result: best });
+            journal.refined = Some(RefinedSummary { views: count, before: start, result: best });
         } else {
             let why = format!("{NO_GAIN} of {start:.2} dB ({count} views)");
             journal.leave_out("refinement", why);

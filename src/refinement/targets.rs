@@ -95,7 +95,7 @@ fn fraction([part, of]: [usize; 2], count: usize) -> usize {
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
-    pub(crate) pictures: Vec<FrameView>,
+    pub(crate) views: Vec<FrameView>,
     /// Purpose of each target view.
     purposes: Vec<Purpose>,
     /// Stride n of the training views: only every n-th column and row of pixels is stored.
@@ -134,10 +134,10 @@ impl Targets {
     pub(crate) fn new(scene: &Scene, max_views: usize, stride: NonZeroU32, has_test_views: bool) -> Result<Targets> {
         let [scene_views, new_views] = view_counts(max_views, scene.workload().pixels);
         let seen = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
-        let (cameras, pictures) = add_new_views(scene, seen, new_views);
-        let purposes = (0..pictures.len()).map(|k| purpose(k, pictures.len(), has_test_views)).collect();
-        let key = scene.work.key(&(&cameras, &pictures, stride, has_test_views));
-        let targets = Targets { cameras, pictures, purposes, stride, key, values: Vec::new() };
+        let (cameras, views) = add_new_views(scene, seen, new_views);
+        let purposes = (0..views.len()).map(|k| purpose(k, views.len(), has_test_views)).collect();
+        let key = scene.work.key(&(&cameras, &views, stride, has_test_views));
+        let targets = Targets { cameras, views, purposes, stride, key, values: Vec::new() };
         targets.filled(NAME, scene, |_| None)
     }
 
@@ -160,37 +160,37 @@ impl Targets {
         let new_views = fraction(RENDERS_PER_PHOTOGRAPH, seen.len());
         // Index in the schedule of each of the cameras that `add_new_views` lists first.
         let used = scene.schedule.used_cameras();
-        let mut cameras_with_photographs: Vec<u32> = seen.iter().map(|picture| picture.camera).collect();
+        let mut cameras_with_photographs: Vec<u32> = seen.iter().map(|view| view.camera).collect();
         cameras_with_photographs.sort_unstable();
         cameras_with_photographs.dedup();
         let by_camera = cameras_with_photographs.len() >= VALIDATION_CAMERA_EVERY;
-        let is_validation = |(k, picture): &(usize, &FrameView)| match by_camera {
+        let is_validation = |(k, view): &(usize, &FrameView)| match by_camera {
             true => {
-                let camera = cameras_with_photographs.binary_search(&picture.camera).unwrap_or_default();
+                let camera = cameras_with_photographs.binary_search(&view.camera).unwrap_or_default();
                 camera % VALIDATION_CAMERA_EVERY == VALIDATION_CAMERA_EVERY / 2
             }
             // Chooses another position in every group of n photographs, so that all cameras of a small rig take part.
             false => k % VALIDATION_CAMERA_EVERY == k / VALIDATION_CAMERA_EVERY % VALIDATION_CAMERA_EVERY,
         };
-        let frame_and_view = |picture: &FrameView| (picture.frame, picture.view);
+        let frame_and_view = |view: &FrameView| (view.frame, view.view);
         let validation: HashSet<(usize, u32)> =
-            seen.iter().enumerate().filter(is_validation).map(|(_, picture)| frame_and_view(picture)).collect();
+            seen.iter().enumerate().filter(is_validation).map(|(_, view)| frame_and_view(view)).collect();
         let stamps = photographs.file_stamps(&seen)?;
-        let (cameras, pictures) = add_new_views(scene, seen, new_views);
-        let purpose = |picture: &FrameView| match validation.contains(&frame_and_view(picture)) {
+        let (cameras, views) = add_new_views(scene, seen, new_views);
+        let purpose = |view: &FrameView| match validation.contains(&frame_and_view(view)) {
             true => Purpose::Validation,
             false => Purpose::Training,
         };
-        let purposes = pictures.iter().map(purpose).collect();
-        let key = scene.work.key(&(&cameras, &pictures, stride, stamps));
-        let targets = Targets { cameras, pictures, purposes, stride, key, values: Vec::new() };
-        targets.filled(PHOTOGRAPHS_NAME, scene, |picture| {
+        let purposes = views.iter().map(purpose).collect();
+        let key = scene.work.key(&(&cameras, &views, stride, stamps));
+        let targets = Targets { cameras, views, purposes, stride, key, values: Vec::new() };
+        targets.filled(PHOTOGRAPHS_NAME, scene, |view| {
             // A view from a new camera has no photograph.
-            let camera = *used.get(picture.camera as usize)?;
-            let picture = FrameView { camera, ..picture };
+            let camera = *used.get(view.camera as usize)?;
+            let view = FrameView { camera, ..view };
             photographs
-                .has(picture)
-                .then(|| photographs.read(picture, &scene.schedule.cameras[camera as usize], scene.background))
+                .has(view)
+                .then(|| photographs.read(view, &scene.schedule.cameras[camera as usize], scene.background))
         })
     }
 
@@ -210,25 +210,25 @@ impl Targets {
             for_each_view_batch(
                 subject,
                 &self.cameras,
-                &self.pictures[some],
+                &self.views[some],
                 BatchLimits::one_frame(&scene.limits),
                 |views| {
-                    let picture = |(k, (view, renderer)): (usize, (&ViewStates<'_, 1>, &mut Renderer))| {
+                    let view_values = |(k, (view, renderer)): (usize, (&ViewStates<'_, 1>, &mut Renderer))| {
                         let grid = self.grid(next + k, self.stride);
-                        Ok(narrow(&match photograph(view.picture) {
+                        Ok(narrow(&match photograph(view.frame_view) {
                             Some(photograph) => sampled(&photograph?, grid),
                             None => renderer.render(view.states[0], grid.sampled_view(view.camera), scene.background),
                         }))
                     };
                     renderers.resize_with(renderers.len().max(views.len()), Renderer::on_all_threads);
                     let jobs = views.par_iter().zip(renderers.par_iter_mut()).enumerate();
-                    let made: Vec<Vec<u16>> = jobs.map(picture).collect::<Result<_>>()?;
+                    let made: Vec<Vec<u16>> = jobs.map(view_values).collect::<Result<_>>()?;
                     next += views.len();
-                    made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
+                    made.iter().try_for_each(|view_values| values.write(bytemuck::cast_slice(view_values)))
                 },
             )
         };
-        self.values = scene.work.spill_in_shards(name, self.key, self.pictures.len(), &scene.scratch, make)?;
+        self.values = scene.work.spill_in_shards(name, self.key, self.views.len(), &scene.scratch, make)?;
         Ok(self)
     }
 
@@ -239,7 +239,7 @@ impl Targets {
 
     /// Returns the indices of the training, validation and test views.
     pub(crate) fn split(&self) -> ViewSplit {
-        let with_purpose = |purpose| (0..self.pictures.len()).filter(|&k| self.purposes[k] == purpose).collect();
+        let with_purpose = |purpose| (0..self.views.len()).filter(|&k| self.purposes[k] == purpose).collect();
         ViewSplit {
             training: with_purpose(Purpose::Training),
             validation: with_purpose(Purpose::Validation),
@@ -269,7 +269,7 @@ impl Targets {
 
     /// Returns the camera of target view `k`.
     pub(super) fn camera(&self, k: usize) -> &Camera {
-        &self.cameras[self.pictures[k].camera as usize]
+        &self.cameras[self.views[k].camera as usize]
     }
 
     /// Returns how many columns and how many rows of pixels of view `k` are rendered and compared, if only every
@@ -319,35 +319,35 @@ fn purpose(k: usize, count: usize, has_test_views: bool) -> Purpose {
     }
 }
 
-/// Adds to the views `pictures`, by which Gaussians are scored, `between_views` views from new cameras: cameras between
-/// those of the scene and, if [`Scene::outside`] is not 0, cameras outside the rig. Returns the cameras, and the views
-/// sorted by frame.
-fn add_new_views(scene: &Scene, mut pictures: Vec<FrameView>, between_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
+/// Adds to `views`, by which Gaussians are scored, `between_views` views from new cameras: cameras between those of the
+/// scene and, if [`Scene::outside`] is not 0, cameras outside the rig. Returns the cameras, and the views sorted by
+/// frame.
+fn add_new_views(scene: &Scene, mut views: Vec<FrameView>, between_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let used = scene.schedule.used_cameras();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
-    for picture in &mut pictures {
-        picture.camera = used.binary_search(&picture.camera).unwrap_or_default() as u32;
+    for view in &mut views {
+        view.camera = used.binary_search(&view.camera).unwrap_or_default() as u32;
     }
-    let (seen, mut random) = (pictures.len(), SplitMix64(2));
+    let (seen, mut random) = (views.len(), SplitMix64(2));
     let rig = scene.rig_cameras();
     let more_views = if seen == 0 { 0 } else { between_views };
     let outer_views = (OUTSIDE_FRACTION * scene.outside * more_views as f64) as usize;
     let outer = cameras_outside(&rig, outer_views, 1.0 + scene.outside);
     let inner = cameras_between(&rig, more_views - outer.len());
     for camera in outer.into_iter().chain(inner) {
-        let frame = pictures[random.next_below(seen)].frame;
-        pictures.push(FrameView { frame, view: u32::MAX, camera: cameras.len() as u32 });
+        let frame = views[random.next_below(seen)].frame;
+        views.push(FrameView { frame, view: u32::MAX, camera: cameras.len() as u32 });
         cameras.push(camera);
     }
-    pictures.sort_by_key(|picture| picture.frame);
-    (cameras, pictures)
+    views.sort_by_key(|view| view.frame);
+    (cameras, views)
 }
 
-/// Returns the mean square error of the render `picture` against the target view `target`, whose color values are
-/// 16-bit integers. Color values are from 0 to 1; the render is clamped to this range.
-pub(crate) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
+/// Returns the mean square error of `render` against the target view `target`, whose color values are 16-bit integers.
+/// Color values are from 0 to 1; the render is clamped to this range.
+pub(crate) fn mean_square(render: &Image, target: &[u16]) -> f64 {
     let square = |(value, &wanted): (&f32, &u16)| f64::from(value.clamp(0.0, 1.0) - wide(wanted)).powi(2);
-    picture.data.iter().zip(target).map(square).sum::<f64>() / target.len().max(1) as f64
+    render.data.iter().zip(target).map(square).sum::<f64>() / target.len().max(1) as f64
 }
 
 /// Returns the pixels of `image` that are on `grid`.
@@ -360,9 +360,9 @@ fn sampled(image: &Image, grid: PixelGrid) -> Image {
 }
 
 /// Converts the color values of a render, 0 to 1, to 16-bit integers. Values outside this range are clamped.
-pub(super) fn narrow(picture: &Image) -> Vec<u16> {
+pub(super) fn narrow(image: &Image) -> Vec<u16> {
     // NaN becomes 0.
-    picture.data.iter().map(|value| (value.clamp(0.0, 1.0) * f32::from(u16::MAX)).round() as u16).collect()
+    image.data.iter().map(|value| (value.clamp(0.0, 1.0) * f32::from(u16::MAX)).round() as u16).collect()
 }
 
 /// Converts a 16-bit value made by [`narrow`] back to a value from 0 to 1.
@@ -376,10 +376,10 @@ mod tests {
 
     #[test]
     fn sixteen_bits_are_accurate_to_1e_5() {
-        let picture = Image { width: 1, height: 1, data: vec![0.0, 1.0, 0.123_456] };
-        let back: Vec<f32> = narrow(&picture).into_iter().map(wide).collect();
-        assert!(back.iter().zip(&picture.data).all(|(a, b)| (a - b).abs() < 1e-5), "{back:?}");
-        let odd = Image { data: vec![-3.0, f32::NAN, 7.0], ..picture };
+        let image = Image { width: 1, height: 1, data: vec![0.0, 1.0, 0.123_456] };
+        let back: Vec<f32> = narrow(&image).into_iter().map(wide).collect();
+        assert!(back.iter().zip(&image.data).all(|(a, b)| (a - b).abs() < 1e-5), "{back:?}");
+        let odd = Image { data: vec![-3.0, f32::NAN, 7.0], ..image };
         assert_eq!(narrow(&odd), [0, 0, u16::MAX]);
     }
 

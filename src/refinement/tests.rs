@@ -102,7 +102,7 @@ fn interrupted_runs_resume_to_the_same_result() {
     let short = folder.path().join("scene.gseq");
     drop(scene(folder.path()));
     // The three models have explicit frames, a deformation field, and explicit frames with a time-varying delta.
-    for (number, path, steps, pictures) in [(0, short, 120, 60), (1, model, 120, 60), (2, long, 300, 300)] {
+    for (number, path, steps, target_views) in [(0, short, 120, 60), (1, model, 120, 60), (2, long, 300, 300)] {
         let open = |work: Option<CacheRequest>| {
             let cameras = (number == 1).then(|| path.clone());
             let options = InputOptions { path: path.clone(), cameras, work, ..Default::default() };
@@ -121,7 +121,7 @@ fn interrupted_runs_resume_to_the_same_result() {
             let few = RefineStage {
                 steps,
                 steps_per_prune: 40,
-                pictures,
+                target_views,
                 ..RefineStage::from_recipe(&recipe, None, true).unwrap()
             };
             few.run(scene, &scored, reduction, count / 4, &mut Journal::default())
@@ -365,7 +365,7 @@ fn values_at_a_stride_do_not_depend_on_the_stored_stride() {
         let targets = Targets::new(&scene, 60, stride(stored), true).unwrap();
         let split = targets.split();
         assert!(!split.training.is_empty() && !split.validation.is_empty() && !split.test.is_empty());
-        for k in 0..targets.pictures.len() {
+        for k in 0..targets.views.len() {
             for wanted in [stride(stored), stride(2 * stored)] {
                 let [expected, got] = [&all, &targets].map(|targets| targets.values(k, wanted).unwrap());
                 let size = targets.view(k, wanted).grid.size([targets.camera(k).width, targets.camera(k).height]);

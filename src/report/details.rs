@@ -312,7 +312,7 @@ fn sweep_section(first: &Analysis, sweep: Option<&TradeOff>) -> String {
 
 fn data_links(results: &[Analysis], sweep: Option<&TradeOff>, precision: Option<&PrecisionDiagram>) -> String {
     let first = &results[0];
-    let mut names = vec!["report.json", "pictures.csv", "failure_modes.csv"];
+    let mut names = vec!["report.json", "views.csv", "failure_modes.csv"];
     names.extend(first.data.histograms.as_ref().map(|_| "histograms.csv"));
     names.extend(first.run.summary.as_ref().map(|_| "stages.csv"));
     names.extend(sweep.map(|_| "trade_off.csv"));

@@ -90,8 +90,8 @@ pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
             continue;
         }
         cameras.push(camera);
-        let pictures = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), FRAMES);
-        let made = side.render_pairs(&pictures, |[original, compressed]| {
+        let views = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), FRAMES);
+        let made = side.render_pairs(&views, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
             let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));
             let images =
@@ -104,7 +104,7 @@ pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
             why: choice.why.clone(),
             view,
             camera_of_frame: choice.frame,
-            frames: pictures.iter().map(|picture| picture.frame).collect(),
+            frames: views.iter().map(|frame_view| frame_view.frame).collect(),
             psnr: made.iter().map(|made| made.0).collect(),
             size: (of.width.div_ceil(shrunk), of.height.div_ceil(shrunk)),
             shrunk,

@@ -43,7 +43,7 @@ pub struct CompressedModelData {
     /// Comparison with the original: mean scores over all renders, by view and by frame.
     pub evaluation: Evaluation,
     /// Scores of every compared render.
-    pub pictures: Vec<ViewScores>,
+    pub view_scores: Vec<ViewScores>,
     /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,

@@ -160,7 +160,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     })?;
     let has_cache = side.scene.work.is_enabled();
     let compared = if has_cache { Some(side.evaluate_as_first_stage()?) } else { None };
-    side.scene.schedule = scored_pictures(&side.scene, &run)?;
+    side.scene.schedule = scored_views(&side.scene, &run)?;
     if has_cache {
         // The comparison above has the cache key of the command `evaluate`, so both commands share its result. The keys
         // of later stages also depend on the views that score Gaussians, and on the recipe.
@@ -178,7 +178,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         Some(compared) => (compared, side.observe_sharded("failure", look)?),
     };
     side.scene.work.end_shard_run_before("the page")?;
-    let names: Vec<(usize, u32)> = evaluation.views.iter().map(|picture| (picture.frame, picture.view)).collect();
+    let names: Vec<(usize, u32)> = evaluation.views.iter().map(|view| (view.frame, view.view)).collect();
     let failure_modes: Vec<FailureMode> = GaussianKind::ALL
         .iter()
         .zip(members)
@@ -197,7 +197,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     };
     let data = CompressedModelData {
         verdict: verdict::verdict(&evaluation, &failure_modes),
-        pictures: evaluation.views.clone(),
+        view_scores: evaluation.views.clone(),
         evaluation: evaluation.with_file_names_only(),
         render_time,
         failure_modes,
@@ -254,7 +254,7 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
 /// - Returns the first of these sets that has the stated number of views: training views, all views, held-out views.
 /// - If no set has this number, or if there is no summary, returns the training views, or all views if there are no
 ///   training views.
-fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
+fn scored_views(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
     let mut first = None;
@@ -363,7 +363,7 @@ fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFile
     let mut files = vec![
         (PAGE_FILE, page.to_owned()),
         ("report.json", json),
-        ("pictures.csv", report.result.evaluation.csv()),
+        ("views.csv", report.result.evaluation.csv()),
         ("failure_modes.csv", tables::failure_modes(&report.result.failure_modes)),
         (SUMMARY_FILE, format!("{marker:#}\n")),
     ];

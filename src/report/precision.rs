@@ -64,7 +64,7 @@ fn conditions(found: &PrecisionDiagram) -> String {
          keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
         count(found.gaussians),
         count(found.frames),
-        count(found.pictures),
+        count(found.views_scored),
         count(found.frames_scored),
         found.judged,
         escape(&found.cameras),

@@ -57,16 +57,16 @@ pub struct ChosenRender {
 /// Returns the renders that the page shows, chosen from the comparison `found`; the worst render comes first. A render
 /// that is chosen for several reasons occurs once, with all its reasons.
 pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
-    let pictures = &found.views;
+    let scores = &found.views;
     let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
-        places.min_by(|&a, &b| pictures[a].loss.psnr.total_cmp(&pictures[b].loss.psnr))
+        places.min_by(|&a, &b| scores[a].loss.psnr.total_cmp(&scores[b].loss.psnr))
     };
-    let mut by_psnr: Vec<usize> = (0..pictures.len()).collect();
-    by_psnr.sort_by(|&a, &b| pictures[a].loss.psnr.total_cmp(&pictures[b].loss.psnr));
+    let mut by_psnr: Vec<usize> = (0..scores.len()).collect();
+    by_psnr.sort_by(|&a, &b| scores[a].loss.psnr.total_cmp(&scores[b].loss.psnr));
     let view = found.loss.per_view.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.view);
     let frame = found.loss.per_frame.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.frame);
-    let of_view = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].view) == view));
-    let of_frame = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].frame) == frame));
+    let of_view = lowest(&mut (0..scores.len()).filter(|&i| Some(scores[i].view) == view));
+    let of_frame = lowest(&mut (0..scores.len()).filter(|&i| Some(scores[i].frame) == frame));
     let wanted = [
         (WORST, by_psnr.first().copied()),
         ("worst view", of_view),
@@ -80,7 +80,7 @@ pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
             same.why.push(why.to_owned());
             continue;
         }
-        let of = &pictures[place];
+        let of = &scores[place];
         let ImageScore { psnr, ssim, flip, .. } = of.loss;
         chosen.push(ChosenRender {
             why: vec![why.to_owned()],
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_uri_holds_the_picture() {
+    fn a_uri_holds_the_image() {
         let uri = data_uri(&image(5, 4, |i| i as f32 / 60.0)).unwrap();
         let bytes = STANDARD.decode(uri.strip_prefix("data:image/png;base64,").unwrap()).unwrap();
         let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();

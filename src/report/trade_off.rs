@@ -45,7 +45,7 @@ pub(super) fn section(found: &TradeOff) -> String {
         escape(&found.path),
         count(found.gaussians),
         bytes(found.bytes),
-        found.pictures,
+        found.views,
         found.threads
     );
     for (caption, svg) in charts(found) {
@@ -214,7 +214,7 @@ mod tests {
             gaussians: 100,
             bytes: 24_800,
             threads: 1,
-            pictures: 3,
+            views: 3,
             cameras: String::new(),
             runs: 3,
             points,

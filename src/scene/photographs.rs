@@ -27,21 +27,21 @@ impl Photographs {
         let mut files = HashMap::new();
         let mut view_of_file: HashMap<PathBuf, FrameView> = HashMap::new();
         for found in found {
-            let (picture, file) = found?;
+            let (view, file) = found?;
             // Cameras with time stamps may give all their views the same file name.
-            if let Some(other) = view_of_file.insert(file.clone(), picture) {
+            if let Some(other) = view_of_file.insert(file.clone(), view) {
                 let found =
                     format!("{}, which also belongs to frame {}, view {}", file.shown(), other.frame, other.view);
-                return Err(Error::input(folder, view_name(picture), "a photograph of its own", found)
+                return Err(Error::input(folder, view_name(view), "a photograph of its own", found)
                     .hint("give the folder that the cameras' file paths start from"));
             }
-            files.insert((picture.frame, picture.view), file);
+            files.insert((view.frame, view.view), file);
         }
         Ok(Photographs { files })
     }
 
-    /// Finds the photographs of the views `pictures` in `folder`. Returns the views that have a photograph, and the
-    /// paths of these photographs. `rig`: cameras and their views. `times`: times of the frames.
+    /// Finds the photographs of `views` in `folder`. Returns the views that have a photograph, and the paths of these
+    /// photographs. `rig`: cameras and their views. `times`: times of the frames.
     ///
     /// First, photographs are found by the image paths in the camera file: a photograph is the file in `folder` whose
     /// path is the longest suffix of the image path. Only if no view has such a photograph, photographs are found by
@@ -56,88 +56,88 @@ impl Photographs {
         folder: &Path,
         rig: &Rig,
         times: &[f64],
-        pictures: Vec<FrameView>,
+        views: Vec<FrameView>,
     ) -> Result<(Vec<FrameView>, Photographs)> {
         check_folder(folder)?;
         let cameras = camera_folders(folder)?;
-        let named = |picture: FrameView| Some((picture, inside(folder, rig.image_path(picture, times)?)?));
-        let mut found: Vec<(FrameView, PathBuf)> = pictures.iter().copied().filter_map(named).collect();
+        let named = |view: FrameView| Some((view, inside(folder, rig.image_path(view, times)?)?));
+        let mut found: Vec<(FrameView, PathBuf)> = views.iter().copied().filter_map(named).collect();
         if found.is_empty() {
-            let numbered = |picture: FrameView| Some((picture, numbered_file(folder, picture, &cameras)?));
-            found = pictures.iter().copied().filter_map(numbered).collect();
+            let numbered = |view: FrameView| Some((view, numbered_file(folder, view, &cameras)?));
+            found = views.iter().copied().filter_map(numbered).collect();
         }
-        if let (true, Some(&picture)) = (found.is_empty(), pictures.first()) {
-            let named = rig.image_path(picture, times).and_then(Path::file_name);
+        if let (true, Some(&view)) = (found.is_empty(), views.first()) {
+            let named = rig.image_path(view, times).and_then(Path::file_name);
             let named = named.map_or_else(String::new, |name| format!(", {}", name.shown()));
-            let expected = format!("{}.png{named} or {}", picture.name(), in_rig(Path::new("camNN"), picture).shown());
+            let expected = format!("{}.png{named} or {}", view.name(), in_rig(Path::new("camNN"), view).shown());
             return Err(Error::input(
                 folder,
-                view_name(picture),
+                view_name(view),
                 expected,
                 "no such file, and no photograph of any other view",
             ));
         }
-        let pictures = found.iter().map(|(picture, _)| *picture).collect();
-        Ok((pictures, Photographs::from_files(folder, found.into_iter().map(Ok))?))
+        let views = found.iter().map(|(view, _)| *view).collect();
+        Ok((views, Photographs::from_files(folder, found.into_iter().map(Ok))?))
     }
 
-    /// Returns whether the view `picture` has a photograph.
-    pub fn has(&self, picture: FrameView) -> bool {
-        self.files.contains_key(&(picture.frame, picture.view))
+    /// Returns whether `view` has a photograph.
+    pub fn has(&self, view: FrameView) -> bool {
+        self.files.contains_key(&(view.frame, view.view))
     }
 
-    /// Returns for each photograph of the views `pictures` its path, its length in bytes, and the time of its last
-    /// change (ns since 1970). They show whether the photographs have changed, without reading them.
+    /// Returns for each photograph of `views` its path, its length in bytes, and the time of its last change (ns since
+    /// 1970). They show whether the photographs have changed, without reading them.
     ///
     /// # Errors
     /// Fails if a file does not exist any more.
-    pub fn file_stamps(&self, pictures: &[FrameView]) -> Result<Vec<(String, u64, u128)>> {
-        let mut files = Vec::with_capacity(pictures.len());
-        for picture in pictures {
-            if let Some(file) = self.files.get(&(picture.frame, picture.view)) {
+    pub fn file_stamps(&self, views: &[FrameView]) -> Result<Vec<(String, u64, u128)>> {
+        let mut files = Vec::with_capacity(views.len());
+        for view in views {
+            if let Some(file) = self.files.get(&(view.frame, view.view)) {
                 stamps(&fs::canonicalize(file).map_err(Error::io("find", file))?, &mut files)?;
             }
         }
         Ok(files)
     }
 
-    /// Checks that the photographs of the views `pictures` can be read and have the sizes of their cameras. Decodes only
-    /// the first photograph; of the others, reads only the image size. `cameras`: cameras of the views, by camera index.
+    /// Checks that the photographs of `views` can be read and have the sizes of their cameras. Decodes only the first
+    /// photograph; of the others, reads only the image size. `cameras`: cameras of the views, by camera index.
     ///
     /// # Errors
     /// Fails if the first file is not a PNG, or if a file is not an image of its camera's size.
-    pub fn check_files(&self, pictures: &[FrameView], cameras: &[Camera]) -> Result<()> {
-        if let Some(&first) = pictures.first() {
+    pub fn check_files(&self, views: &[FrameView], cameras: &[Camera]) -> Result<()> {
+        if let Some(&first) = views.first() {
             self.read(first, &cameras[first.camera as usize], [0.0; 3])?;
         }
-        for picture in pictures {
-            let Some(file) = self.files.get(&(picture.frame, picture.view)) else { continue };
-            let camera = &cameras[picture.camera as usize];
+        for view in views {
+            let Some(file) = self.files.get(&(view.frame, view.view)) else { continue };
+            let camera = &cameras[view.camera as usize];
             let expected = format!("a PNG of {}x{} pixels, the size of the camera", camera.width, camera.height);
             let found = match measure(file) {
                 Some(size) if size == (camera.width, camera.height) => continue,
                 Some((width, height)) => format!("{width}x{height} pixels"),
                 None => "no image".to_owned(),
             };
-            return Err(Error::input(file, view_name(*picture), expected, found));
+            return Err(Error::input(file, view_name(*view), expected, found));
         }
         Ok(())
     }
 
-    /// Reads the photograph of the view `picture`, taken by `camera`. Transparent pixels are blended with `background`.
+    /// Reads the photograph of `view`, taken by `camera`. Transparent pixels are blended with `background`.
     ///
     /// # Errors
     /// Fails if the view has no photograph, or if the file is not an image of the camera's size.
-    pub fn read(&self, picture: FrameView, camera: &Camera, background: [f32; 3]) -> Result<Image> {
-        let file = self.files.get(&(picture.frame, picture.view));
-        let file = file.ok_or_else(|| Error::usage(format!("no photograph was found for {}", picture.name())))?;
+    pub fn read(&self, view: FrameView, camera: &Camera, background: [f32; 3]) -> Result<Image> {
+        let file = self.files.get(&(view.frame, view.view));
+        let file = file.ok_or_else(|| Error::usage(format!("no photograph was found for {}", view.name())))?;
         read_png(file, (camera.width, camera.height), background)
     }
 }
 
 /// Returns the name of a view for messages, such as `frame 3, view 0`.
-fn view_name(picture: FrameView) -> String {
-    format!("frame {}, view {}", picture.frame, picture.view)
+fn view_name(view: FrameView) -> String {
+    format!("frame {}, view {}", view.frame, view.view)
 }
 
 /// Checks that `folder` is an existing folder; fails if it is not.
@@ -148,11 +148,11 @@ fn check_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Finds the photograph of the view `picture` by its frame and view number: `tNNN_vNN.png` (frame, view) in `folder`,
-/// else the frame's file in the camera folder `cameras[view]`. Returns `None` if neither file exists.
-fn numbered_file(folder: &Path, picture: FrameView, cameras: &[PathBuf]) -> Option<PathBuf> {
-    let in_camera = cameras.get(picture.view as usize).map(|camera| in_rig(camera, picture));
-    let files = [Some(folder.join(format!("{}.png", picture.name()))), in_camera];
+/// Finds the photograph of `view` by its frame and view number: `tNNN_vNN.png` (frame, view) in `folder`, else the
+/// frame's file in the folder of the view number in `cameras`. Returns `None` if neither file exists.
+fn numbered_file(folder: &Path, view: FrameView, cameras: &[PathBuf]) -> Option<PathBuf> {
+    let in_camera = cameras.get(view.view as usize).map(|camera| in_rig(camera, view));
+    let files = [Some(folder.join(format!("{}.png", view.name()))), in_camera];
     files.into_iter().flatten().find(|file| file.is_file())
 }
 
@@ -170,9 +170,9 @@ fn camera_folders(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(found.into_iter().map(|(_, path)| path).collect())
 }
 
-/// Returns the path of the photograph of the view `picture` in the DyNeRF camera folder `camera`.
-fn in_rig(camera: &Path, picture: FrameView) -> PathBuf {
-    camera.join("images").join(format!("{:04}.png", picture.frame))
+/// Returns the path of the photograph of `view` in the DyNeRF camera folder `camera`.
+fn in_rig(camera: &Path, view: FrameView) -> PathBuf {
+    camera.join("images").join(format!("{:04}.png", view.frame))
 }
 
 /// Returns the file in `folder` whose path relative to `folder` is the longest suffix of the path `image`; `None` if no

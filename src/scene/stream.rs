@@ -196,10 +196,10 @@ pub fn receiving_estimate(
         fixed.push(("blocks", work.threads * GAUSSIANS_PER_BLOCK as u64 * whole));
         if visible {
             let nothing_held = Workload { input: MemoryProfile { frame_block: 0, ..work.input }, ..*work };
-            let (more, pictures) =
+            let (more, fixed_parts) =
                 nothing_held.view_pass_memory(limits, Attributes::all().difference(Attributes::SH), 12);
             per_gaussian.extend(more);
-            fixed.extend(pictures);
+            fixed.extend(fixed_parts);
         }
     }
     ResourceEstimate { stage: "receive", reads: 0.0, seconds: 0.0, per_gaussian, fixed }

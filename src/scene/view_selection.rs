@@ -40,7 +40,7 @@ pub fn select_views(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec
 /// Fails if two cameras have the same frame and view number.
 pub(crate) fn distinct_views(rig: &Rig, views: impl Iterator<Item = FrameView>) -> Result<Vec<FrameView>> {
     let mut found: Vec<FrameView> = views.collect();
-    found.sort_by_key(|picture| (picture.frame, picture.view));
+    found.sort_by_key(|view| (view.frame, view.view));
     // The files of training and test cameras may both list the same view.
     found.dedup();
     match found.windows(2).find(|pair| (pair[0].frame, pair[0].view) == (pair[1].frame, pair[1].view)) {
@@ -76,43 +76,43 @@ pub fn select_view(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, 
         return Err(Error::usage(format!("--frame {frame}: expected 0 to {last}, the frames of this sequence")));
     }
     let here: Vec<FrameView> =
-        select_views(rig, frame_times, part)?.into_iter().filter(|picture| picture.frame == frame).collect();
-    here.iter().find(|picture| picture.view == view).copied().ok_or_else(|| {
-        let views: Vec<String> = here.iter().map(|picture| picture.view.to_string()).collect();
+        select_views(rig, frame_times, part)?.into_iter().filter(|frame_view| frame_view.frame == frame).collect();
+    here.iter().find(|frame_view| frame_view.view == view).copied().ok_or_else(|| {
+        let views: Vec<String> = here.iter().map(|frame_view| frame_view.view.to_string()).collect();
         let views = if views.is_empty() { "none".to_owned() } else { views.join(", ") };
         Error::usage(format!("--view {view}: expected a view of frame {frame}, which are {views} ({})", rig.origin))
     })
 }
 
-/// Returns the views in `pictures` at `count` evenly spaced frames, which include the first and the last. Returns all
+/// Returns the views in `views` at `count` evenly spaced frames, which include the first and the last. Returns all
 /// views if they have at most `count` frames; a `count` of 0 counts as 1. Of K frames, those with the indices
 /// round(i·(K − 1)/(count − 1)), halves to even, are chosen, as by numpy's `round(linspace(0, K − 1, count))`.
-pub fn select_frames(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
+pub fn select_frames(views: Vec<FrameView>, count: usize) -> Vec<FrameView> {
     let count = count.max(1);
-    let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
+    let mut frames: Vec<usize> = views.iter().map(|view| view.frame).collect();
     frames.dedup();
     if count >= frames.len() {
-        return pictures;
+        return views;
     }
     let step = (frames.len() - 1) as f64 / (count - 1).max(1) as f64;
     // As `count` is less than the number of frames, steps exceed 1 and no frame is taken twice.
     let kept: Vec<usize> = (0..count).map(|i| frames[(i as f64 * step).round_ties_even() as usize]).collect();
-    pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
+    views.into_iter().filter(|view| kept.binary_search(&view.frame).is_ok()).collect()
 }
 
-/// Returns at most `most` of the views `pictures`, spread evenly over frames and view numbers. `pictures` must be
-/// sorted by frame, then view.
+/// Returns at most `most` of `views`, spread evenly over frames and view numbers. `views` must be sorted by frame, then
+/// view.
 ///
 /// The views are picked at equal distances from a list of all views, ordered by frame. In this list, the views of the
 /// n-th frame are shifted cyclically among themselves, by this fraction of their number: the fractional part of n times
 /// the golden ratio. Without the shift, the same view numbers would be picked again and again.
-pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
-    let (count, most) = (pictures.len(), most.max(1));
+pub fn spread_views(views: Vec<FrameView>, most: usize) -> Vec<FrameView> {
+    let (count, most) = (views.len(), most.max(1));
     if count <= most {
-        return pictures;
+        return views;
     }
     let mut rotated = Vec::with_capacity(count);
-    for (number, frame) in pictures.chunk_by(|a, b| a.frame == b.frame).enumerate() {
+    for (number, frame) in views.chunk_by(|a, b| a.frame == b.frame).enumerate() {
         let turn = (number as f64 * GOLDEN_RATIO).fract() * frame.len() as f64;
         let (head, tail) = frame.split_at((turn as usize).min(frame.len() - 1));
         rotated.extend_from_slice(tail);
@@ -120,7 +120,7 @@ pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
     }
     // Takes the middle view of each of `most` equal parts of the list.
     let mut spread: Vec<FrameView> = (0..most).map(|k| rotated[(2 * k + 1) * count / (2 * most)]).collect();
-    spread.sort_by_key(|picture| (picture.frame, picture.view));
+    spread.sort_by_key(|view| (view.frame, view.view));
     spread
 }
 
@@ -149,23 +149,23 @@ pub fn render_estimate(
     models: u64,
     pixel: u64,
 ) -> ResourceEstimate {
-    let pictures = work.threads.min(limits.views_together as u64);
+    let views_together = work.threads.min(limits.views_together as u64);
     ResourceEstimate {
         stage,
         reads: models as f64,
         seconds: models as f64
             * (work.reading_seconds(work.gaussian_count(), work.frames as f64)
-                + work.render_seconds(work.pictures as f64, work.gaussian_count(), RENDER_COST)),
+                + work.render_seconds(work.frame_views as f64, work.gaussian_count(), RENDER_COST)),
         per_gaussian: vec![
             ("states", models * work.state_bytes(Attributes::all())),
             ("readers", models * work.input.reader),
             ("held", models * work.kept_frames_bytes(limits, Attributes::all())),
-            ("views", pictures * SHARED_VIEW_BYTES_PER_GAUSSIAN),
+            ("views", views_together * SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ],
         fixed: vec![
             work.block_buffer_memory(),
-            ("views", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
-            Workload::view_list_memory(work.pictures as f64),
+            ("views", views_together * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
+            Workload::view_list_memory(work.frame_views as f64),
         ],
     }
 }
@@ -200,23 +200,23 @@ mod tests {
         }
     }
 
-    fn pairs(pictures: &[FrameView]) -> Vec<(usize, u32)> {
-        pictures.iter().map(|picture| (picture.frame, picture.view)).collect()
+    fn pairs(views: &[FrameView]) -> Vec<(usize, u32)> {
+        views.iter().map(|view| (view.frame, view.view)).collect()
     }
 
     #[test]
     fn spread_views_cover_frames_and_views() {
-        let picture = |k: usize| FrameView { frame: k / 9, view: (k % 9) as u32, camera: 0 };
-        let all: Vec<FrameView> = (0..180).map(picture).collect();
+        let view_at = |k: usize| FrameView { frame: k / 9, view: (k % 9) as u32, camera: 0 };
+        let all: Vec<FrameView> = (0..180).map(view_at).collect();
         assert_eq!(spread_views(all.clone(), 180), all);
         let some = spread_views(all, 60);
         assert_eq!(some.len(), 60);
         assert!(some.windows(2).all(|pair| (pair[0].frame, pair[0].view) < (pair[1].frame, pair[1].view)));
         for value in 0..20 {
-            assert_eq!(some.iter().filter(|picture| picture.frame == value).count(), 3, "frame {value}");
+            assert_eq!(some.iter().filter(|view| view.frame == value).count(), 3, "frame {value}");
         }
         for view in 0..9 {
-            let count = some.iter().filter(|picture| picture.view == view).count();
+            let count = some.iter().filter(|frame_view| frame_view.view == view).count();
             assert!((3..=11).contains(&count), "view {view}: {count} of 60");
         }
     }

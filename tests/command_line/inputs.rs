@@ -233,7 +233,7 @@ fn ground_truth_is_compared_and_counted_where_it_exists() {
     let some = json(line);
     let left = photos.len() as u64 / 2;
     assert_eq!((&some["ground_truth"]["pairs"], &some["ground_truth"]["of"]), (&left.into(), &of.into()));
-    assert_eq!(some["psnr"], whole["psnr"], "the models are compared on all pictures");
+    assert_eq!(some["psnr"], whole["psnr"], "the models are compared on all views");
     let text = workplace.done(&format!("{line} --csv scores.csv"));
     assert!(text.contains(&format!("{left} of {of} views have a photograph in photos")), "{text}");
     let csv = fs::read_to_string(workplace.path("scores.csv")).unwrap();

@@ -154,15 +154,15 @@ fn container_packed_in_shards_equals_one_run() {
 #[test]
 fn renders_in_shards_equal_one_run() {
     let workplace = workplace(300);
-    let line = "render scene.gseq --cameras cameras.json --all -o pictures";
-    assert_joined_equals_single_run(&workplace, line, "pictures", &SHARD_COUNTS);
-    assert_joined_equals_single_run(&workplace, &format!("{line} --as npy"), "pictures", &[2]);
+    let line = "render scene.gseq --cameras cameras.json --all -o renders";
+    assert_joined_equals_single_run(&workplace, line, "renders", &SHARD_COUNTS);
+    assert_joined_equals_single_run(&workplace, &format!("{line} --as npy"), "renders", &[2]);
 }
 
 #[test]
 fn missing_shard_is_named_and_computed_when_joining() {
     let workplace = workplace(300);
-    let line = "render scene.gseq --cameras cameras.json --all -o pictures --cache work";
+    let line = "render scene.gseq --cameras cameras.json --all -o renders --cache work";
     for index in [1, 3, 4] {
         workplace.done(&format!("--quiet {line} --shard {index}/5"));
     }
@@ -177,7 +177,7 @@ fn missing_shard_is_named_and_computed_when_joining() {
         run.stderr
     );
     workplace.done("--quiet render scene.gseq --cameras cameras.json --all -o other");
-    assert!(files(&workplace.path("pictures")) == files(&workplace.path("other")));
+    assert!(files(&workplace.path("renders")) == files(&workplace.path("other")));
 }
 
 /// Returns the keys of the cached shards of `stage`.

@@ -85,7 +85,7 @@ fn archive_reads_like_the_folder_it_unpacks_to() {
         serde_json::from_str(&workplace.done(&format!("evaluate {{tiny}} {path} --cameras {{tiny}} --json"))).unwrap()
     };
     assert_eq!(evaluated("small.gsz")["psnr"], evaluated("small")["psnr"]);
-    workplace.done("render small.gsz --cameras {tiny} --all -o pictures");
+    workplace.done("render small.gsz --cameras {tiny} --all -o renders");
     workplace.done("info small.gsz");
     workplace.done("compress small.gsz --cameras {tiny} --ratio 0.5 --no-refine --prune-only -o smaller");
     assert_eq!(

@@ -34,7 +34,7 @@ fn psnr_search_is_reported_on_separate_views() {
         assert_eq!((goal["name"].as_str(), number("asked")), (Some("min_psnr"), least));
         assert!(number("searched") >= least, "{goal}");
         assert!((number("held") - number("searched")).abs() < 3.0, "{goal}");
-        assert!(goal["held_pictures"].as_array().unwrap().len() >= 100, "{goal}");
+        assert!(goal["held_views"].as_array().unwrap().len() >= 100, "{goal}");
         // Every tried count that reaches the PSNR is at least as large as the chosen one.
         let count = summary["gaussians"].as_u64().unwrap();
         let reaches = |tried: &&Value| tried[1].as_f64().unwrap() >= least;
@@ -70,10 +70,7 @@ fn max_loss_compares_with_photographs() {
     assert_eq!(goal["name"], "max_loss");
     let (searched, held) = (goal["searched"].as_f64().unwrap(), goal["held"].as_f64().unwrap());
     assert!(searched <= 60.0 && (searched - held).abs() < 3.0, "{goal}");
-    assert!(
-        goal["held_pictures"].as_array().unwrap().iter().all(|name| name.as_str().unwrap().contains("_v")),
-        "{goal}"
-    );
+    assert!(goal["held_views"].as_array().unwrap().iter().all(|name| name.as_str().unwrap().contains("_v")), "{goal}");
     let tighter = workplace.summary(&format!(
         "{QUICKLY} --no-refine --max-loss 22dB --ground-truth photographs --overwrite -o small.gseq"
     ));

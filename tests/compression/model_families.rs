@@ -193,7 +193,7 @@ fn every_command_accepts_dynamic_3d_gaussians() {
         .done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
     workplace.done(&format!("convert {model} packed.gseq"));
     workplace.done(&format!("score {model} --cameras {model} -o rows.csv"));
-    workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png"));
+    workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o render.png"));
 }
 
 #[test]
@@ -318,7 +318,7 @@ fn every_command_accepts_spacetime_gaussians() {
         assert!(psnr(&workplace, &model, "merged") > least);
         workplace.done(&format!("convert {model} packed.gseq --cameras {model} --overwrite"));
         workplace.done(&format!("score {model} --cameras {model} -o rows.csv --overwrite"));
-        workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png --overwrite"));
+        workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o render.png --overwrite"));
         workplace.done(&format!("report {model} merged --cameras {model} -o report --overwrite"));
     }
 }
@@ -416,7 +416,7 @@ fn every_command_accepts_checkpoints() {
         done(&format!("compress {model} -o merged --merge-only --preset strong --no-refine"));
         done(&format!("convert {model} packed.gseq"));
         done(&format!("score {model} -o rows.csv"));
-        done(&format!("render {model} --frame 3 --view 1 -o picture.png"));
+        done(&format!("render {model} --frame 3 --view 1 -o render.png"));
         done(&format!("report {model} merged -o page"));
     }
 }
@@ -471,6 +471,6 @@ fn check_every_command(models: &[(&str, &str, &str, f64)]) {
         ));
         workplace.done(&format!("convert {model} p.gseq --cameras {cameras} --overwrite"));
         workplace.done(&format!("score {model} --cameras {cameras} -o rows.csv --overwrite"));
-        workplace.done(&format!("render {model} --cameras {cameras} --frame 3 --view 1 -o picture.png --overwrite"));
+        workplace.done(&format!("render {model} --cameras {cameras} --frame 3 --view 1 -o render.png --overwrite"));
     }
 }

@@ -61,7 +61,7 @@ fn exact_settings_have_no_error_and_others_converge() {
     assert_eq!(found, read(&fs::read_to_string(place.path("diagrams/precision.json")).unwrap()));
     assert_eq!(found["kept"], 300);
     // 5 frames of 6 cameras, of which one is a test camera.
-    assert_eq!((&found["pictures"], &found["judged"]), (&25.into(), &5.into()));
+    assert_eq!((&found["views_scored"], &found["judged"]), (&25.into(), &5.into()));
 
     for curve in curves(&found, "scoring") {
         for kind in ["C", "W", "kept", "staying", "added"] {

@@ -81,7 +81,7 @@ fn sweep_points_equal_compress_and_evaluate() {
             assert_eq!(point[name], evaluated[name], "{method} {name}");
         }
         assert_eq!(point["bytes"], evaluated["bytes"]["compressed"]);
-        assert_eq!(swept["pictures"], evaluated["pairs"]);
+        assert_eq!(swept["views"], evaluated["pairs"]);
     }
 }
 

@@ -360,7 +360,7 @@ fn decompressed(bytes: &[u8]) -> Vec<Vec<u8>> {
 fn outputs_contain_no_folder_names_of_the_machine() {
     let secret = Secret::new();
     secret.run(&format!("compress {{m}} --cameras {{m}} {SHORT} -o {{o}}/small"));
-    secret.run("render {m} --cameras {m} --frame 0 --view 0 -o {o}/picture.png");
+    secret.run("render {m} --cameras {m} --frame 0 --view 0 -o {o}/render.png");
     secret.run("convert {m} {o}/frames --cameras {m} --as ply-sequence");
     secret.check(true);
     let recipe = fs::read_to_string(secret.place.join("out/small/recipe.toml")).unwrap();
@@ -420,7 +420,7 @@ fn slow_archives_contain_no_folder_names_of_training() {
     assert!(config.contains("source_path='model', model_path='tiny'"), "{config}");
     secret.run("info {o}/small");
     // The unpacked folder loads, and finds the cameras of a folder of that name beside it.
-    secret.run("render {o}/small --cameras {m} --frame 0 --view 0 -o {o}/picture.png");
+    secret.run("render {o}/small --cameras {m} --frame 0 --view 0 -o {o}/render.png");
 }
 
 #[test]

@@ -47,9 +47,9 @@ fn decibels(page: &mut Browser, scene: &Scene, show: &str, view: u32, frame: usi
     go(page, &format!("show={show}&camera={view}&frame={frame}&paused&exact"));
     let (width, height, found) = pixels(page);
     let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
-    let picture = render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
-    assert!(picture.data.iter().any(|x| (x - picture.data[0]).abs() > 0.2), "an empty picture tells nothing");
-    psnr(&browser::image_from_bytes(width, height, &found), &picture)
+    let expected = render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
+    assert!(expected.data.iter().any(|x| (x - expected.data[0]).abs() > 0.2), "an empty render tells nothing");
+    psnr(&browser::image_from_bytes(width, height, &found), &expected)
 }
 
 /// Returns the faults of the page with three exceptions: its worker, files of its own folder, and messages of a
@@ -86,17 +86,17 @@ fn page_draws_like_the_rasterizer_and_requests_no_url() {
     for (file, folder) in [(whole, None), (at.path("scene/index.html"), Some(at.path("scene")))] {
         let mut page = Browser::start_drawing(&program);
         page.open(&file);
-        let mut pictures = Vec::new();
+        let mut images = Vec::new();
         for (view, frame) in [(0, 0), (2, 17), (1, 29)] {
             for (show, scene) in [("original", &original), ("compressed", &compressed)] {
                 let found = decibels(&mut page, scene, show, view, frame);
                 eprintln!("{show}, view {view}, frame {frame}: {found:.1} dB");
                 assert!(found >= LEAST_DB, "{show}, view {view}, frame {frame}: {found} dB");
-                pictures.push(pixels(&mut page));
+                images.push(pixels(&mut page));
             }
         }
         assert_eq!(complaints(&page, folder.as_deref()), Vec::<String>::new());
-        of_forms.push(pictures);
+        of_forms.push(images);
     }
     assert!(of_forms[0] == of_forms[1], "a folder shows something else than a page");
 }
@@ -127,7 +127,7 @@ fn times_are_interpolated_and_a_wipe_shows_both_models() {
     let half = |y: u32| beside[6 * (y * width) as usize..][..3 * width as usize].to_vec();
     assert_eq!(half(height / 2), row(&left.2, height / 2, 0..width));
     let (_, _, difference) = shown("show=difference&frame=12");
-    // Four times what differs, of pictures that are rounded to bytes.
+    // Four times what differs, of images that are rounded to bytes.
     let expected = |k: usize| (4 * left.2[k].abs_diff(right.2[k]) as u32).min(255);
     assert!((0..difference.len()).all(|k| u32::from(difference[k]).abs_diff(expected(k)) <= 5));
     assert!(difference.iter().any(|&x| x > 20), "both models look the same");
@@ -179,7 +179,7 @@ fn page_plays_seeks_turns_jumps_and_escapes_names() {
     let first = value(&mut page, "scrub");
     page.value(wait);
     assert!(first != value(&mut page, "scrub"), "it stands still");
-    // As soon as some pictures were drawn, which takes its time without a graphics card.
+    // As soon as some images were drawn, which takes its time without a graphics card.
     let rated = "new Promise(done => { const id = setInterval(() => { \
                  if (document.getElementById('rate').textContent) { clearInterval(id); done(); } }, 100); })";
     page.value(rated);
@@ -199,7 +199,7 @@ fn page_plays_seeks_turns_jumps_and_escapes_names() {
     assert!(pixels(&mut page) != at_seven);
     page.key(",", 188);
     page.value("splatsieve.settled()");
-    assert!(pixels(&mut page) == at_seven, "back at the frame is another picture");
+    assert!(pixels(&mut page) == at_seven, "back at the frame is another image");
     // A drag turns the camera; choosing the number of the camera restores it.
     page.drag(&[[500.0, 300.0], [560.0, 320.0], [600.0, 330.0]]);
     page.value("splatsieve.settled()");
@@ -340,9 +340,9 @@ fn trained_models_look_as_in_the_rasterizer() {
             go(&mut page, &format!("camera={view}&frame={shown}&paused&exact&x={name}"));
             let (width, height, found) = pixels(&mut page);
             let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
-            let picture =
+            let expected =
                 render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
-            let decibels = psnr(&browser::image_from_bytes(width, height, &found), &picture);
+            let decibels = psnr(&browser::image_from_bytes(width, height, &found), &expected);
             eprintln!("{name}, view {view}, frame {frame}: {decibels:.1} dB");
             assert!(decibels >= LEAST_DB, "{name}, view {view}, frame {frame}: {decibels} dB");
         }

@@ -40,7 +40,7 @@ fn sweep() -> Value {
     };
     json!({
         "tool": "splatsieve 0.1.0", "path": "d/scene.gseq", "digest": "00", "gaussians": 1200, "bytes": 72_000,
-        "threads": 2, "pictures": 5, "cameras": "d/cameras.json",
+        "threads": 2, "views": 5, "cameras": "d/cameras.json",
         "points": [point("default", 600, 40.0), point("default", 300, 30.0), point("<i>odd</i>", 600, 20.0)],
         "runs": 3, "knobs": [{ "parameter": "<b>knob</b>", "settings": [setting(20, 31.0), setting(50, 33.0)] }],
         "notes": ["three <b>points</b>"],
@@ -61,7 +61,7 @@ fn report_data_equal_those_of_evaluate_and_of_the_run() {
     let said = at.done(&format!("report {rest} --sweep sweep.json -o r"));
     let found = data(&at, "r");
     assert_eq!(found["evaluation"], expected);
-    assert!(read(&at.path("r/pictures.csv")) == read(&at.path("all.csv")), "pictures.csv is not that of evaluate");
+    assert!(read(&at.path("r/views.csv")) == read(&at.path("all.csv")), "views.csv is not that of evaluate");
     let verdict = found["verdict"].as_str().unwrap();
     assert!(said.starts_with(verdict) && said.trim_end().ends_with("report.html"), "{said}");
     let run: Value = serde_json::from_str(&read(&at.path("small.gseq.summary.json"))).unwrap();
@@ -93,8 +93,8 @@ fn report_data_equal_those_of_evaluate_and_of_the_run() {
         assert!(merged > 0 && kept > 0, "{}", histogram["name"]);
     }
     // The first shown render is the worst of the list.
-    let psnr = |picture: &Value| picture["loss"]["psnr"].as_f64().unwrap();
-    let worst = found["pictures"].as_array().unwrap().iter().map(psnr).fold(f64::INFINITY, f64::min);
+    let psnr = |view: &Value| view["loss"]["psnr"].as_f64().unwrap();
+    let worst = found["view_scores"].as_array().unwrap().iter().map(psnr).fold(f64::INFINITY, f64::min);
     assert_eq!(found["shown"][0]["psnr"].as_f64(), Some(worst));
     assert!(found["shown"][0]["why"].as_array().unwrap().contains(&json!("worst render")));
 }

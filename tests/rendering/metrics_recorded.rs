@@ -30,7 +30,7 @@ fn metrics_agree_with_reference_implementations() {
             [("psnr", psnr(a, b), 1e-9), ("ssim", ssim(a, b), 1e-9), ("flip", flip(a, b), 1e-4)]
         {
             let expected = expected[name][i].as_f64().unwrap();
-            assert!((got - expected).abs() < tolerance, "{name} of picture {i}: got {got}, expected {expected}");
+            assert!((got - expected).abs() < tolerance, "{name} of image {i}: got {got}, expected {expected}");
         }
     }
 }

@@ -147,7 +147,7 @@ fn png_is_the_clamped_rounded_array() {
     }
     assert!(lit > 1000, "only {lit} pixels show anything");
     let listed = files(&at("pngs")).len();
-    assert_eq!(listed, FRAMES * TEST_NAMES.len() + 1, "the test pictures and summary.json");
+    assert_eq!(listed, FRAMES * TEST_NAMES.len() + 1, "the test renders and summary.json");
     done(folder.path(), "render scene.gseq --cameras cameras.json --frame 2 --view 0 -o one.npy");
     assert!(
         fs::read(at("one.npy")).unwrap() == fs::read(at("arrays/t002_v00.npy")).unwrap(),
@@ -196,12 +196,12 @@ fn renders_ignore_thread_count() {
     let results = ["1", "2", "7"].map(|threads| {
         let out = format!("t{threads}");
         done(folder.path(), &format!("render scene.gseq --cameras cameras.json --all --as npy -o {out} --threads {threads}"));
-        let pictures: Vec<Vec<u8>> = files(&folder.path().join(&out)).into_values().collect();
+        let renders: Vec<Vec<u8>> = files(&folder.path().join(&out)).into_values().collect();
         let line = format!(
             "evaluate scene.gseq smaller.gseq --cameras cameras.json --ground-truth photos --json --csv {out}.csv --threads {threads}"
         );
         let scores = without_render_time(&done(folder.path(), &line));
-        (pictures, scores, fs::read(folder.path().join(format!("{out}.csv"))).unwrap())
+        (renders, scores, fs::read(folder.path().join(format!("{out}.csv"))).unwrap())
     });
     assert!(results[0] == results[1] && results[0] == results[2], "results depend on the number of threads");
 }
@@ -367,7 +367,7 @@ fn wrong_inputs_exit_with_1_and_leave_no_files() {
     small.set_color(png::ColorType::Rgb);
     small.write_header().unwrap().write_image_data(&[0; 6]).unwrap();
     refused(folder.path(), evaluate, 1, &["t003_v02.png", "48 x 36", "2 x 1"]);
-    fs::write(&photo, "no picture").unwrap();
+    fs::write(&photo, "no image").unwrap();
     refused(folder.path(), evaluate, 1, &["t003_v02.png", "a PNG image"]);
     refused(folder.path(), "evaluate scene.gseq none.gseq --cameras cameras.json", 1, &["none.gseq"]);
 }

@@ -19,7 +19,7 @@ const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 /// loss with respect to the image.
 fn gradients(gaussians: &Gaussians, camera: &Camera, pull: impl FnOnce(&Image) -> Image) -> Gradients {
     let mut gradients = Gradients::new(gaussians.len(), Attributes::all(), gaussians.sh_degree());
-    Renderer::new().gradient(gaussians, camera, BACKGROUND, |picture| (0.0, pull(picture)), &mut gradients);
+    Renderer::new().gradient(gaussians, camera, BACKGROUND, |image| (0.0, pull(image)), &mut gradients);
     gradients
 }
 
@@ -49,9 +49,9 @@ fn gradients_match_central_differences_of_the_oracle() {
             .collect();
         let mut random = Random(seed + 100);
         let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next_f32()).collect();
-        let found = gradients(&gaussians, &camera, |picture| Image {
-            data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
-            ..*picture
+        let found = gradients(&gaussians, &camera, |image| Image {
+            data: (0..target.len()).map(|at| sure[at / 3] as f32 * (image.data[at] - target[at])).collect(),
+            ..*image
         });
 
         let blended = oracle::blended_indices(&gaussians, &camera);
@@ -141,16 +141,16 @@ fn image_moves_by_focal_length_over_depth() {
     // The loss is the first moment of the image along u. Its derivative with respect to the position x is Σ alpha times
     // contrast and f/z.
     let (gaussians, camera) = (single_gaussian(2.0, 0.05, 0.6), plain_camera(48));
-    let found = gradients(&gaussians, &camera, |picture| {
+    let found = gradients(&gaussians, &camera, |image| {
         let mut moment = plain_image(&camera, [0.0; 3]);
-        (0..moment.data.len()).step_by(3).for_each(|at| moment.data[at] = ((at / 3) as u32 % picture.width) as f32);
+        (0..moment.data.len()).step_by(3).for_each(|at| moment.data[at] = ((at / 3) as u32 % image.width) as f32);
         moment
     });
-    let picture = render(&gaussians, &camera, [0.0; 3]);
+    let image = render(&gaussians, &camera, [0.0; 3]);
     // Alpha drops from 1/255 to 0 at the edge of the splat. By integration by parts, the derivative is therefore Σ
     // (alpha − 1/255) times contrast and f/z.
     let above = |red: f32| (f64::from(red) - 1.0 / 255.0).max(0.0);
-    let red: f64 = picture.data.chunks_exact(3).map(|pixel| above(pixel[0])).sum();
+    let red: f64 = image.data.chunks_exact(3).map(|pixel| above(pixel[0])).sum();
     let expected = red * (1.0 - 0.1) * 50.0 / 2.0;
     let got = f64::from(found.column(Attributes::POSITION).plane(0)[0]);
     // The sum over whole pixels is the integral, except for pixels on the edge.
@@ -160,16 +160,16 @@ fn image_moves_by_focal_length_over_depth() {
 #[test]
 fn gradients_ignore_threads_buffers_frozen_attributes() {
     let camera = tilted_camera(131, 77);
-    let noise = |picture: &Image| {
+    let noise = |image: &Image| {
         let mut random = Random(7);
-        Image { data: picture.data.iter().map(|x| x - random.next_f32()).collect(), ..*picture }
+        Image { data: image.data.iter().map(|x| x - random.next_f32()).collect(), ..*image }
     };
     let mut kept = Renderer::new();
     for (seed, count) in [(31, 20_000), (32, 300), (33, 9000)] {
         let scene = random_gaussians(seed, count, 2);
         let with = |renderer: &mut Renderer, columns, degree| {
             let mut found = Gradients::new(count, columns, degree);
-            let value = renderer.gradient(&scene, &camera, BACKGROUND, |picture| (1.5, noise(picture)), &mut found);
+            let value = renderer.gradient(&scene, &camera, BACKGROUND, |image| (1.5, noise(image)), &mut found);
             assert_eq!(value, 1.5);
             found
         };
@@ -199,7 +199,7 @@ fn gradients_of_several_renders_add_up() {
     let mut both = Gradients::new(200, Attributes::all(), 1);
     let mut renderer = Renderer::new();
     for camera in &views {
-        renderer.gradient(&scene, camera, BACKGROUND, |picture| (0.0, picture.clone()), &mut both);
+        renderer.gradient(&scene, camera, BACKGROUND, |image| (0.0, image.clone()), &mut both);
     }
     let apart = views.each_ref().map(|camera| gradients(&scene, camera, Image::clone));
     for column in Attributes::all().iter() {
@@ -282,8 +282,8 @@ fn clamped_alpha_has_gradients_only_for_color() {
 fn nonfinite_pixels_have_no_gradient() {
     let (scene, camera) = (random_gaussians(71, 300, 1), tilted_camera(50, 40));
     let spoiled = |value: f32| {
-        gradients(&scene, &camera, |picture| {
-            let mut pull = picture.clone();
+        gradients(&scene, &camera, |image| {
+            let mut pull = image.clone();
             (30..33).for_each(|c| pull.data[3 * 777 + c] = value);
             pull
         })
@@ -316,9 +316,9 @@ fn stored_positions_get_gradients_through_the_field() {
         .collect();
     let mut random = Random(7);
     let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next_f32()).collect();
-    let mut found = gradients(&state, &camera, |picture| Image {
-        data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
-        ..*picture
+    let mut found = gradients(&state, &camera, |image| Image {
+        data: (0..target.len()).map(|at| sure[at / 3] as f32 * (image.data[at] - target[at])).collect(),
+        ..*image
     });
     let direct = found.clone();
     deformation.with_params(stored).jacobian(frame, Attributes::all()).unwrap().pull_back(&mut found);

@@ -27,5 +27,5 @@ fn reference_renders_are_reproduced_to_rounding() {
             compared += 1;
         }
     }
-    assert!(compared >= models::NAMES.len(), "only {compared} pictures had a recorded state");
+    assert!(compared >= models::NAMES.len(), "only {compared} renders had a recorded state");
 }

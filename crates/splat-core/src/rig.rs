@@ -153,13 +153,13 @@ impl Rig {
             .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))
     }
 
-    /// Returns the path of the photograph that belongs to `picture` (a camera at a frame). Returns `None` if the camera
+    /// Returns the path of the photograph that belongs to `view` (a camera at a frame). Returns `None` if the camera
     /// file names no photograph for it. `frame_times` are the increasing times of the frames.
-    pub fn image_path(&self, picture: FrameView, frame_times: &[f64]) -> Option<&Path> {
+    pub fn image_path(&self, view: FrameView, frame_times: &[f64]) -> Option<&Path> {
         let shows = |shot: &&Shot| {
             let frame = || self.frame_of(shot, frame_times).ok();
-            (shot.view, shot.camera) == (picture.view, picture.camera)
-                && frame().is_some_and(|frame| frame.is_none_or(|frame| frame == picture.frame))
+            (shot.view, shot.camera) == (view.view, view.camera)
+                && frame().is_some_and(|frame| frame.is_none_or(|frame| frame == view.frame))
         };
         self.shots.iter().find(shows)?.image.as_deref()
     }

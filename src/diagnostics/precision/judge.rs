@@ -19,7 +19,7 @@ const MAX_VIEWS: usize = 24;
 ///
 /// Memory: 12 bytes for every pixel of at most 24 views.
 pub(super) struct Judge {
-    pictures: Vec<FrameView>,
+    views: Vec<FrameView>,
     originals: Vec<Image>,
 }
 
@@ -41,10 +41,10 @@ impl Judge {
     pub(super) fn new(scene: &Scene) -> Result<Judge> {
         let all = select_views(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?;
         let count = all.len().min(MAX_VIEWS);
-        let pictures: Vec<FrameView> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
+        let views: Vec<FrameView> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
         let mut originals = Vec::with_capacity(count);
-        render_views(scene, RenderedSource::all_gaussians(scene.source()), &pictures, |image| originals.push(image))?;
-        Ok(Judge { pictures, originals })
+        render_views(scene, RenderedSource::all_gaussians(scene.source()), &views, |image| originals.push(image))?;
+        Ok(Judge { views, originals })
     }
 
     /// Returns the bytes of memory that the renders of a [`Judge`] take if each view has `pixels` pixels.
@@ -53,8 +53,8 @@ impl Judge {
     }
 
     /// Returns the number of views on which quality is measured.
-    pub(super) fn pictures(&self) -> usize {
-        self.pictures.len()
+    pub(super) fn view_count(&self) -> usize {
+        self.views.len()
     }
 
     /// Renders only the Gaussians of `scene` with the ids `kept`, and compares these renders with those of the whole
@@ -66,9 +66,7 @@ impl Judge {
         let subject = RenderedSource { source: scene.source(), ids: Some(Ids::List(kept)), columns: Attributes::all() };
         let mut originals = self.originals.iter();
         let mut found = Vec::with_capacity(self.originals.len());
-        render_views(scene, subject, &self.pictures, |image| {
-            found.extend(originals.next().map(|of| psnr(&image, of)))
-        })?;
+        render_views(scene, subject, &self.views, |image| found.extend(originals.next().map(|of| psnr(&image, of))))?;
         Ok(JudgedQuality::from_psnr(&found))
     }
 }
@@ -83,18 +81,17 @@ impl JudgedQuality {
     }
 }
 
-/// Renders `subject`, a model or some of its Gaussians, in the views `pictures` and passes the images to `take`, in
-/// order.
+/// Renders `subject`, a model or some of its Gaussians, in each of `views` and passes the images to `take`, in order.
 fn render_views(
     scene: &Scene,
     subject: RenderedSource<'_>,
-    pictures: &[FrameView],
+    views: &[FrameView],
     mut take: impl FnMut(Image),
 ) -> Result<()> {
     let cameras: &[Camera] = &scene.schedule.cameras;
-    for_each_view_batch([subject], cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
+    for_each_view_batch([subject], cameras, views, BatchLimits::one_frame(&scene.limits), |batch| {
         let images: Vec<Image> =
-            views.par_iter().map(|view| render(view.states[0], view.camera, scene.background)).collect();
+            batch.par_iter().map(|view| render(view.states[0], view.camera, scene.background)).collect();
         images.into_iter().for_each(&mut take);
         Ok(())
     })

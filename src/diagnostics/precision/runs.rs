@@ -167,7 +167,7 @@ impl Bench<'_> {
     /// - `step`: step size h of this value (how coarse it is); an error of order p is proportional to h^p
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
-        let psnr: Vec<f64> = evaluation.views.iter().map(|picture| picture.loss.psnr).collect();
+        let psnr: Vec<f64> = evaluation.views.iter().map(|view| view.loss.psnr).collect();
         let JudgedQuality { error, psnr } = JudgedQuality::from_psnr(&psnr);
         Ok(PrecisionSetting {
             value,

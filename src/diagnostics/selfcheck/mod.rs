@@ -14,7 +14,7 @@ mod field;
 pub mod generated;
 mod merging;
 pub mod oracle;
-mod pictures;
+mod renders;
 mod score;
 mod statistics;
 mod storage;
@@ -47,13 +47,13 @@ const CASES: [fn() -> CaseResult; 28] = [
     merging::duplicates,
     field::states,
     field::derivative,
-    pictures::one_gaussian,
-    pictures::many_gaussians,
-    pictures::weights,
-    pictures::removal,
-    pictures::harmonics,
-    pictures::gradients,
-    pictures::comparison,
+    renders::one_gaussian,
+    renders::many_gaussians,
+    renders::weights,
+    renders::removal,
+    renders::harmonics,
+    renders::gradients,
+    renders::comparison,
     storage::container,
     storage::bounded_container,
     storage::archive_grid,

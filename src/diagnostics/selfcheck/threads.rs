@@ -51,7 +51,7 @@ fn run_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
         let bytes = fs::read(&path).map_err(Error::io("read", &path))?;
         let scene = random_gaussians(31, 3000, 1);
         let mut gradients = Gradients::new(scene.len(), Attributes::all(), 1);
-        let loss = |picture: &Image| (0.0, picture.clone());
+        let loss = |image: &Image| (0.0, image.clone());
         Renderer::on_all_threads().gradient(&scene, &tilted_camera(80, 60), [0.5; 3], loss, &mut gradients);
         Ok((bytes, gradients))
     })

@@ -26,8 +26,8 @@ use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
     ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, BYTES_PER_PIXEL,
-    OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met, pictures,
-    step_change,
+    OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met, step_change,
+    view_count,
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::progress::Progress;
@@ -124,7 +124,7 @@ impl ArchiveStage {
     /// decoded archive.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
-        let count = pictures(work.pixels);
+        let count = view_count(work.pixels);
         // About forty groups of values are quantized alone in every balancing round, and all together in each halving.
         let looked = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
         ResourceEstimate {

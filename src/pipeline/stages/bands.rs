@@ -114,13 +114,13 @@ impl ShDegreeStage {
             ("held", held + bytes_of_survivors(output_fraction, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
-        let pictures = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.pictures) } else { 0 };
+        let views = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.frame_views) } else { 0 };
         ResourceEstimate {
             stage: NAME,
-            seconds: work.reading_seconds(work.gaussian_count(), 2.0 * pictures as f64)
-                + work.render_seconds(pictures as f64, work.gaussian_count(), RENDER_COST)
-                + work.render_seconds(2.0 * pictures as f64, output_fraction * work.gaussian_count(), RENDER_COST),
-            reads: 2.0 * work.scattered_full_reads(pictures, limits),
+            seconds: work.reading_seconds(work.gaussian_count(), 2.0 * views as f64)
+                + work.render_seconds(views as f64, work.gaussian_count(), RENDER_COST)
+                + work.render_seconds(2.0 * views as f64, output_fraction * work.gaussian_count(), RENDER_COST),
+            reads: 2.0 * work.scattered_full_reads(views, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.block_buffer_memory(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
         }
@@ -138,12 +138,10 @@ impl ShDegreeStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
-        let pictures = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
+        let views = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
         let stay = match scene.input.needs_all_bands() {
             _ if all == 0 => Some("colors have SH degree 0"),
-            None if compressed.is_empty() || pictures.is_empty() => {
-                Some("there are no Gaussians or no views to compare")
-            }
+            None if compressed.is_empty() || views.is_empty() => Some("there are no Gaussians or no views to compare"),
             why => why,
         };
         if let Some(why) = stay {
@@ -154,14 +152,14 @@ impl ShDegreeStage {
         let (mut found, mut tried, mut sh_degree) = ([0.0; 2], Vec::new(), all);
         // A lower degree is tried only if the last one was accepted.
         while sh_degree > 0 && tried.len() == all - sh_degree {
-            let [result, apart] = quality_without_degrees(scene, &*source, sh_degree - 1, &pictures)?;
+            let [result, apart] = quality_without_degrees(scene, &*source, sh_degree - 1, &views)?;
             found = [result, min_psnr(result, self.margin)];
             tried.push((sh_degree - 1, apart));
             sh_degree -= usize::from(apart >= found[1]);
         }
         drop(source);
         let [result, least] = found;
-        let found = ShDegreeSummary { sh_degree, pictures: pictures.len(), tried, result, least };
+        let found = ShDegreeSummary { sh_degree, views: views.len(), tried, result, least };
         if sh_degree == all {
             journal.leave_out(DROPPED_DEGREES, found.why());
         }
@@ -170,28 +168,28 @@ impl ShDegreeStage {
     }
 }
 
-/// Returns two mean PSNRs over the views `pictures`, dB. First: renders of `result` against renders of the original.
-/// Second: renders of `result` with SH coefficients up to `degree` only, against renders of `result` with all of them.
+/// Returns two mean PSNRs over `views`, dB. First: renders of `result` against renders of the original. Second: renders
+/// of `result` with SH coefficients up to `degree` only, against renders of `result` with all of them.
 fn quality_without_degrees(
     scene: &Scene,
     result: &dyn FrameSource,
     degree: usize,
-    pictures: &[FrameView],
+    views: &[FrameView],
 ) -> Result<[f64; 2]> {
-    let progress = scene.events.task(NAME, "views", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut sums = [0.0; 2];
     let subjects = [RenderedSource::all_gaussians(scene.source()), RenderedSource::all_gaussians(result)];
-    for_each_view_batch(subjects, &scene.schedule.cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
-        for view in views {
-            let picture = |state: &Gaussians| render(state, view.camera, scene.background);
-            let [original, whole] = view.states.map(picture);
+    for_each_view_batch(subjects, &scene.schedule.cameras, views, BatchLimits::one_frame(&scene.limits), |batch| {
+        for view in batch {
+            let image = |state: &Gaussians| render(state, view.camera, scene.background);
+            let [original, whole] = view.states.map(image);
             let mut state = view.states[1].clone();
             state.truncate_sh(degree);
             sums[0] += psnr(&original, &whole);
-            sums[1] += psnr(&picture(&state), &whole);
+            sums[1] += psnr(&image(&state), &whole);
         }
-        progress.advance(views.len() as u64);
+        progress.advance(batch.len() as u64);
         Ok(())
     })?;
-    Ok(sums.map(|sum| sum / pictures.len() as f64))
+    Ok(sums.map(|sum| sum / views.len() as f64))
 }

@@ -89,8 +89,8 @@ impl Choose {
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let together = VIEWS_PER_BATCH.min(limits.views_together) as u64;
-        let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
-        let frames = (COMPARED_VIEWS as u64).min(work.pictures);
+        let view_bytes = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
+        let frames = (COMPARED_VIEWS as u64).min(work.frame_views);
         // Renders of the original, and of two alternatives with about half as many Gaussians.
         let made = work.render_seconds(frames as f64, 2.0 * work.gaussian_count(), RENDER_COST)
             + work.render_seconds(2.0 * frames as f64, 0.0, RENDER_COST);
@@ -99,7 +99,7 @@ impl Choose {
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64) + made,
             reads: work.full_reads(frames, limits) + work.scattered_full_reads(frames, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![work.block_buffer_memory(), ("views", pictures)],
+            fixed: vec![work.block_buffer_memory(), ("views", view_bytes)],
         }
     }
 
@@ -129,10 +129,10 @@ impl Choose {
             return Ok(merged);
         }
         let pruned = ranking.best_ids(count);
-        let pictures = select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
-        let key = scene.work.key(&(&pruned, compressed, &pictures));
+        let views = select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
+        let key = scene.work.key(&(&pruned, compressed, &views));
         let [without, with]: [f64; 2] = journal.run_cached_stage(NAME, count, scene, key, |_| {
-            Ok((mean_psnr(scene, &pruned, compressed, &pictures)?, count))
+            Ok((mean_psnr(scene, &pruned, compressed, &views)?, count))
         })?;
         if with > without {
             return Ok(merged);
@@ -148,29 +148,29 @@ impl Choose {
     }
 }
 
-/// Returns two mean PSNRs against the original over the views `pictures`, dB. First: of the model that consists of the
-/// unchanged Gaussians `pruned` (increasing ids). Second: of the model `merged`.
-fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[FrameView]) -> Result<[f64; 2]> {
+/// Returns two mean PSNRs against the original over `views`, dB. First: of the model that consists of the unchanged
+/// Gaussians `pruned` (increasing ids). Second: of the model `merged`.
+fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, views: &[FrameView]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
-    let progress = scene.events.task(NAME, "views", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut sums = [0.0; 2];
-    let pictures_together = VIEWS_PER_BATCH.min(scene.limits.views_together);
-    let batch = BatchLimits { views: pictures_together, ..BatchLimits::one_frame(&scene.limits) };
+    let views_together = VIEWS_PER_BATCH.min(scene.limits.views_together);
+    let max_batch = BatchLimits { views: views_together, ..BatchLimits::one_frame(&scene.limits) };
     let subjects = [RenderedSource::all_gaussians(scene.source()), RenderedSource::all_gaussians(&*result)];
-    for_each_view_batch(subjects, &scene.schedule.cameras, pictures, batch, |views| {
-        let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
-        let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
+    for_each_view_batch(subjects, &scene.schedule.cameras, views, max_batch, |batch| {
+        let image = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
+        let expected: Vec<Image> = batch.iter().map(|view| image(0, view)).collect();
         // All views of a batch show the same frame.
-        let state = views[0].states[0].pick(pruned);
-        let features = views[0].features(0).map(|features| features.pick(pruned));
-        for (view, expected) in views.iter().zip(&expected) {
+        let state = batch[0].states[0].pick(pruned);
+        let features = batch[0].features(0).map(|features| features.pick(pruned));
+        for (view, expected) in batch.iter().zip(&expected) {
             sums[0] += psnr(&view.render_as(0, &state, features.as_ref(), scene.background), expected);
-            sums[1] += psnr(&picture(1, view), expected);
+            sums[1] += psnr(&image(1, view), expected);
         }
-        progress.advance(views.len() as u64);
+        progress.advance(batch.len() as u64);
         Ok(())
     })?;
-    Ok(sums.map(|sum| sum / pictures.len().max(1) as f64))
+    Ok(sums.map(|sum| sum / views.len().max(1) as f64))
 }
 
 #[cfg(test)]

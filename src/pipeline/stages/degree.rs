@@ -88,7 +88,7 @@ impl Degree {
             let first = |gaussians: usize| self.refine.initial_count(gaussians, all).min(ranked.order().len());
             let largest = fits.iter().map(|fit| first(fit.gaussians)).max().unwrap_or_default();
             let stride = self.refine.stored_stride(scene.workload().pixels, largest);
-            let targets = Targets::new(scene, self.refine.pictures, stride, false)?;
+            let targets = Targets::new(scene, self.refine.target_views, stride, false)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
                 let start = CompressedModel {

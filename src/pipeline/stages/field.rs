@@ -84,13 +84,13 @@ impl FieldPrecisionStage {
             ("readers", work.input.reader + bytes_of_survivors(output_fraction, work.input.reader)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
-        let pictures = (COMPARED_VIEWS as u64).min(work.pictures);
+        let views = (COMPARED_VIEWS as u64).min(work.frame_views);
         ResourceEstimate {
             stage: NAME,
-            seconds: work.reading_seconds(work.gaussian_count(), 4.0 * pictures as f64)
-                + work.render_seconds(2.0 * pictures as f64, work.gaussian_count(), RENDER_COST)
-                + work.render_seconds(2.0 * pictures as f64, output_fraction * work.gaussian_count(), RENDER_COST),
-            reads: work.full_reads(pictures, limits),
+            seconds: work.reading_seconds(work.gaussian_count(), 4.0 * views as f64)
+                + work.render_seconds(2.0 * views as f64, work.gaussian_count(), RENDER_COST)
+                + work.render_seconds(2.0 * views as f64, output_fraction * work.gaussian_count(), RENDER_COST),
+            reads: work.full_reads(views, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![
                 work.block_buffer_memory(),
@@ -111,22 +111,22 @@ impl FieldPrecisionStage {
             return Ok(compressed);
         }
         let what = "half precision of the field";
-        let pictures = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
-        if compressed.is_empty() || pictures.is_empty() {
+        let views = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
+        if compressed.is_empty() || views.is_empty() {
             journal.leave_out(what, "there are no Gaussians or no views to compare");
             return Ok(compressed);
         }
         let halved = CompressedModel { field: FieldPrecision::Half, ..compressed.clone() };
         let [exact, half] = [&compressed, &halved].map(|model| scene.input.reduced(model));
         let (exact, half) = (exact?, half?);
-        let rounding = closeness(scene, [&*exact, &*half], &pictures)?;
+        let rounding = closeness(scene, [&*exact, &*half], &views)?;
         let result = match rounding >= MAX_USEFUL_PSNR {
             true => None,
-            false => Some(closeness(scene, [scene.source(), &*exact], &pictures)?),
+            false => Some(closeness(scene, [scene.source(), &*exact], &views)?),
         };
         drop((exact, half));
         let least = result.map_or(MAX_USEFUL_PSNR, |result| min_psnr(result, self.margin));
-        let found = FieldSummary { pictures: pictures.len(), rounding, result, least, half: rounding >= least };
+        let found = FieldSummary { views: views.len(), rounding, result, least, half: rounding >= least };
         let fits = found.half;
         if !fits {
             journal.leave_out(what, found.why());
@@ -143,18 +143,18 @@ pub(crate) fn min_psnr(result: f64, margin: f64) -> f64 {
     MAX_USEFUL_PSNR.min(result + margin)
 }
 
-/// Returns the mean PSNR, dB, between renders of the two models `a` and `b` over the views `pictures`.
-fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[FrameView]) -> Result<f64> {
-    let progress = scene.events.task(NAME, "views", pictures.len() as u64);
+/// Returns the mean PSNR, dB, between renders of the two models `a` and `b` over `views`.
+fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], views: &[FrameView]) -> Result<f64> {
+    let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut sum = 0.0;
     let subjects = [RenderedSource::all_gaussians(a), RenderedSource::all_gaussians(b)];
-    for_each_view_batch(subjects, &scene.schedule.cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
-        for view in views {
+    for_each_view_batch(subjects, &scene.schedule.cameras, views, BatchLimits::one_frame(&scene.limits), |batch| {
+        for view in batch {
             let [a, b] = view.states.map(|state| render(state, view.camera, scene.background));
             sum += psnr(&a, &b);
         }
-        progress.advance(views.len() as u64);
+        progress.advance(batch.len() as u64);
         Ok(())
     })?;
-    Ok(sum / pictures.len() as f64)
+    Ok(sum / views.len() as f64)
 }

@@ -45,8 +45,8 @@ impl Stage for PhotographStage {
     }
 
     fn parameters(&self) -> String {
-        let RefineStage { steps, pictures, .. } = self.refine;
-        format!("photographs: {steps} steps toward {pictures} views, of which about three quarters are photographs")
+        let RefineStage { steps, target_views, .. } = self.refine;
+        format!("photographs: {steps} steps toward {target_views} views, of which about three quarters are photographs")
     }
 
     fn check(&self, scene: &Scene) -> Result<()> {

@@ -108,7 +108,7 @@ impl QualityStage {
     /// Returns the resource estimate of the stage, which renders views of the original and of the result.
     /// `output_fraction`: number of Gaussians in the result divided by that in the input.
     fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
-        let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
+        let views = (MOST_VIEWS as u64).min(work.frame_views.max(1));
         let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
         let result = vec![
             ("kept", bytes_of_survivors(output_fraction, 24)),
@@ -162,7 +162,7 @@ impl QualityStage {
         let render_ms = render_times(scene, result, &views)?;
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
             let psnr = journal.result_psnr().unwrap_or(refined.result);
-            return Ok(Some(QualitySummary { kind, views: refined.pictures, psnr, ssim: None, render_ms }));
+            return Ok(Some(QualitySummary { kind, views: refined.views, psnr, ssim: None, render_ms }));
         }
         let (psnr, ssim) = mean_scores(scene, result, &views)?;
         Ok(Some(QualitySummary { kind, views: views.len(), psnr, ssim: Some(ssim), render_ms }))

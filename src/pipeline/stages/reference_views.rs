@@ -58,7 +58,7 @@ pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;
 
 /// Returns the number of views on which an archive is compared with the result before quantization, if each view has
 /// `pixels` pixels.
-pub(crate) fn pictures(pixels: u64) -> u64 {
+pub(crate) fn view_count(pixels: u64) -> u64 {
     let [fewest, most] = VIEW_COUNTS;
     (MAX_VIEW_BYTES / (2 * BYTES_PER_PIXEL * pixels.max(1))).clamp(fewest, most)
 }
@@ -128,26 +128,26 @@ impl QualityTarget {
 /// Renders of one model (usually the result before quantization), with which renders of other models are compared.
 pub(crate) struct ReferenceViews<'a> {
     scene: &'a Scene,
-    pictures: Vec<FrameView>,
+    views: Vec<FrameView>,
     images: Vec<Image>,
 }
 
 impl ReferenceViews<'_> {
     pub(crate) fn new<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<ReferenceViews<'a>> {
-        let count = pictures(scene.workload().pixels) as usize;
+        let count = view_count(scene.workload().pixels) as usize;
         let mut reference_views =
-            ReferenceViews { scene, pictures: select_evenly(&scene.schedule, count, 1), images: Vec::new() };
+            ReferenceViews { scene, views: select_evenly(&scene.schedule, count, 1), images: Vec::new() };
         reference_views.images = reference_views.render(source, |_, image| image)?;
         Ok(reference_views)
     }
 
     fn render<T: Send>(&self, source: &dyn FrameSource, finish: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
-        let mut rendered = Vec::with_capacity(self.pictures.len());
+        let mut rendered = Vec::with_capacity(self.views.len());
         let batch = BatchLimits::one_frame(&self.scene.limits);
         for_each_view_batch(
             [RenderedSource::all_gaussians(source)],
             &self.scene.schedule.cameras,
-            &self.pictures,
+            &self.views,
             batch,
             |views| {
                 let first = rendered.len();

@@ -39,7 +39,7 @@ pub(crate) struct Rounds {
     /// Fraction of the remaining Gaussians that one pruning round keeps.
     pub fraction: f64,
     /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
-    pub pictures: usize,
+    pub views: usize,
     /// Number of groups into which the views are divided. The first round renders the views of all groups. Every later
     /// round renders one group, and uses the errors that earlier rounds measured for the others.
     pub groups: usize,
@@ -76,8 +76,8 @@ impl Stage for Rounds {
     }
 
     fn parameters(&self) -> String {
-        let (percent, Rounds { pictures, groups, .. }) = (100.0 * self.fraction, self);
-        format!("rounds: each keeps {percent:.0}% of the Gaussians, ranked on {pictures} views in {groups} groups")
+        let (percent, Rounds { views, groups, .. }) = (100.0 * self.fraction, self);
+        format!("rounds: each keeps {percent:.0}% of the Gaussians, ranked on {views} views in {groups} groups")
     }
 
     fn shardable_units(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
@@ -104,29 +104,28 @@ impl Rounds {
     pub(crate) fn from_recipe(recipe: &recipe::SelectParams, target: Option<f64>) -> Option<Rounds> {
         let recipe::SelectParams {
             round_fraction: fraction,
-            round_views: pictures,
+            round_views: views,
             round_groups: groups,
             contrast_floor,
             ..
         } = *recipe;
         let (fewest, usual) = (target.unwrap_or(MIN_LEFT), target.unwrap_or(USUAL_LEFT));
-        (fraction < 1.0).then_some(Rounds { fraction, pictures, groups, contrast_floor, fewest, usual })
+        (fraction < 1.0).then_some(Rounds { fraction, views, groups, contrast_floor, fewest, usual })
     }
 
     /// Returns the resource estimate of the stage. Its memory holds the ranking, the measured removal errors, and the
     /// buffers for rendering all survivors (Gaussians left by pruning).
     pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.view_pass_memory(limits, Attributes::all(), 8);
-        let all = (self.pictures as u64).min(work.pictures);
+        let all = (self.views as u64).min(work.frame_views);
         let groups = (self.groups as u64).min(all).max(1);
         let per_gaussian =
             [scored_memory(limits), vec![("ranking", 32), ("errors", 8 * groups), ("found", 8 * groups)], looking]
                 .concat();
         let seconds = (0..self.rounds(self.usual)).map(|round| {
             let left = work.gaussian_count() * self.fraction.powi(round as i32);
-            let pictures = all as f64 / if round == 0 { 1.0 } else { groups as f64 };
-            work.reading_seconds(left, pictures.min(work.frames as f64))
-                + work.render_seconds(pictures, left, REMOVAL_COST)
+            let views = all as f64 / if round == 0 { 1.0 } else { groups as f64 };
+            work.reading_seconds(left, views.min(work.frames as f64)) + work.render_seconds(views, left, REMOVAL_COST)
         });
         // The first round renders the views of all groups one group after the other, every later round one group.
         let frames = all.min(work.frames).div_ceil(groups);
@@ -146,7 +145,7 @@ impl Rounds {
     /// Returns one line of text for display per pruning round that reduces `count` Gaussians to `fewest`. A line has
     /// the name of the round and the maximum number of views that it renders.
     pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
-        let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.groups.max(1) });
+        let view_count = |round: usize| self.views.div_ceil(if round == 0 { 1 } else { self.groups.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
         rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
@@ -154,9 +153,9 @@ impl Rounds {
     /// Chooses the views by which Gaussians are ranked, and returns them divided into groups. Views of the same frame
     /// are in the same group, unless there are fewer frames than groups.
     fn view_groups(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
-        let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_cover);
-        let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
-        let parts = if by_frame.len() < self.groups { pictures.chunks(1).collect() } else { by_frame };
+        let views = select_evenly_over_frames(&scene.schedule, self.views, scored.frames_to_cover);
+        let by_frame: Vec<&[FrameView]> = views.chunk_by(|a, b| a.frame == b.frame).collect();
+        let parts = if by_frame.len() < self.groups { views.chunks(1).collect() } else { by_frame };
         let mut groups = vec![Vec::new(); self.groups.min(parts.len())];
         let count = groups.len().max(1);
         parts.into_iter().enumerate().for_each(|(k, part)| groups[k % count].extend_from_slice(part));
@@ -209,9 +208,9 @@ impl Rounds {
                 break;
             }
         }
-        let pictures = (done..sizes.len())
+        let view_counts = (done..sizes.len())
             .map(|round| active_groups(&groups, round).map(|group| groups[group].len()).sum::<usize>());
-        let progress = scene.events.task(NAME, "views", pictures.sum::<usize>() as u64);
+        let progress = scene.events.task(NAME, "views", view_counts.sum::<usize>() as u64);
         let RoundState { free, removed, .. } = journal.run_stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
                 state = self.round(scene, scored, (state, &groups), round, (key, left, stride), &progress)?;
@@ -261,16 +260,16 @@ impl Rounds {
         let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
             let mut start = 0;
             let group_errors = |&group: &usize| {
-                let pictures = &groups[group];
-                let place = |unit: usize| unit.saturating_sub(start).min(pictures.len());
+                let views = &groups[group];
+                let place = |unit: usize| unit.saturating_sub(start).min(views.len());
                 let range = place(some.start)..place(some.end);
-                start += pictures.len();
+                start += views.len();
                 if range.is_empty() {
                     return Ok(Vec::new());
                 }
-                let pictures = (&scene.schedule.cameras[..], &pictures[range]);
+                let rendered = (&scene.schedule.cameras[..], &views[range]);
                 let advance = || progress.advance(1);
-                Ok(removal_error(scene.source(), &ids, pictures, background, (floor, stride), scene.limits, advance)?
+                Ok(removal_error(scene.source(), &ids, rendered, background, (floor, stride), scene.limits, advance)?
                     .sum)
             };
             active.iter().map(group_errors).collect()
@@ -362,9 +361,9 @@ mod tests {
         let all: Vec<u32> = (0..1500).collect();
         for target in [150, 500] {
             let quality = |kept: &[u32]| -> f64 {
-                let view_psnr = |picture: &FrameView| {
-                    let original = gather(scene.source(), &all, picture.frame, Attributes::all()).unwrap();
-                    let camera = &scene.schedule.cameras[picture.camera as usize];
+                let view_psnr = |view: &FrameView| {
+                    let original = gather(scene.source(), &all, view.frame, Attributes::all()).unwrap();
+                    let camera = &scene.schedule.cameras[view.camera as usize];
                     psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
                 };
                 select_evenly(&scene.schedule, 12, 1).iter().map(view_psnr).sum::<f64>() / 12.0
@@ -398,10 +397,10 @@ mod tests {
         for (groups, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
             let rounds = Rounds { groups, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
             let parts = rounds.view_groups(&scene, &scored);
-            let all = select_evenly_over_frames(&scene.schedule, rounds.pictures, scored.frames_to_cover);
+            let all = select_evenly_over_frames(&scene.schedule, rounds.views, scored.frames_to_cover);
             assert_eq!(parts.len(), groups.min(all.len()));
             let mut together: Vec<FrameView> = parts.concat();
-            together.sort_by_key(|picture| (picture.frame, picture.view));
+            together.sort_by_key(|view| (view.frame, view.view));
             assert_eq!(together, all, "{groups} groups");
             let frames = |part: &Vec<FrameView>| part.chunk_by(|a, b| a.frame == b.frame).count();
             let read: usize = parts.iter().map(frames).sum();

@@ -252,8 +252,8 @@ impl ByteLimit {
     fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(compressed)?;
         let places: Vec<u32> = (0..compressed.len() as u32).collect();
-        let pictures = select_evenly(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
-        let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
+        let views = select_evenly(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
+        let looked_at = (&scene.schedule.cameras[..], &views[..]);
         let errors =
             removal_error(&*result, &places, looked_at, scene.background, (0.0, NonZeroU32::MIN), scene.limits, || ())?;
         Ok(errors.top_by_error(count, |place| scored.is_protected(compressed.kept[place])))

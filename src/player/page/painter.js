@@ -13,7 +13,7 @@ class Painter {
         this.splat = this.program("quad", "splat");
         this.compose = this.program("cover", "compose");
         this.nothing = gl.createVertexArray();
-        this.pictures = [];
+        this.images = [];
     }
 
     program(vertex, fragment, defines = "") {
@@ -65,27 +65,27 @@ class Painter {
     }
 
     /// Returns image `place` (texture and framebuffer). Makes it anew if it does not have this size.
-    picture(place, width, height) {
+    image(place, width, height) {
         const gl = this.gl;
-        let picture = this.pictures[place];
-        if (picture?.width !== width || picture?.height !== height) {
-            if (picture) {
-                gl.deleteTexture(picture.texture);
-                gl.deleteFramebuffer(picture.target);
+        let image = this.images[place];
+        if (image?.width !== width || image?.height !== height) {
+            if (image) {
+                gl.deleteTexture(image.texture);
+                gl.deleteFramebuffer(image.target);
             }
             const texture = this.texture();
             gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, width, height);
-            picture = this.pictures[place] = { texture, target: this.target([texture]), width, height };
+            image = this.images[place] = { texture, target: this.target([texture]), width, height };
         }
-        return picture;
+        return image;
     }
 
     /// Draws `figure` from the camera `sight` into image `place`.
     paint(figure, place, sight, background) {
         const gl = this.gl, [width, height] = sight.size;
         figure.project(sight);
-        const picture = this.picture(place, width, height);
-        gl.bindFramebuffer(gl.FRAMEBUFFER, picture.target);
+        const image = this.image(place, width, height);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
         gl.viewport(0, 0, width, height);
         gl.clearColor(...background, 1);
         gl.clear(gl.COLOR_BUFFER_BIT);
@@ -98,7 +98,7 @@ class Painter {
         gl.bindVertexArray(figure.order);
         gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, figure.visible);
         gl.disable(gl.BLEND);
-        return picture;
+        return image;
     }
 
     /// Resolves when all requested frames are drawn, so that requests do not pile up on a slow machine.

@@ -200,8 +200,8 @@ function draw() {
     const { canvas } = painter.gl, [width, height] = current.size;
     const wide = mode() === "beside" ? 2 * width : width;
     if (canvas.width !== wide || canvas.height !== height) Object.assign(canvas, { width: wide, height });
-    const pictures = seen().map((place) => painter.paint(models[place].figure, place, current, stage.background));
-    const [a, b = a] = pictures;
+    const images = seen().map((place) => painter.paint(models[place].figure, place, current, stage.background));
+    const [a, b = a] = images;
     if (mode() === "beside") {
         painter.put(a, a, 0, width, 0);
         painter.put(b, b, width, width, 0);

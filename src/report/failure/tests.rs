@@ -145,7 +145,7 @@ fn verdicts_follow_the_stated_thresholds() {
     assert_eq!(verdict(KindTotals { shares: (0.1, 0.009), ..lost }, sums(100.0, 1.0)), Verdict::Untouched);
     assert_eq!(verdict(lost, sums(100.0, 0.009)), Verdict::Passed, "40.5 dB cannot be seen");
     assert_eq!(verdict(lost, sums(4000.0, 40.0)), Verdict::Passed, "20 dB against 21.8 is not apart");
-    // Without an index map the pictures alone decide.
+    // Without an index map the renders alone decide.
     assert_eq!(verdict(KindTotals { fates: None, shares: (0.1, 0.0), ..lost }, sums(100.0, 1.0)), Verdict::Flagged);
     let found = assess_failure_mode(GaussianKind::Motion, lost, &[sums(100.0, 1.0)], &[(3, 7)]);
     assert_eq!(found.psnr_on_kind, Some(20.0));

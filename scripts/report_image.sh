@@ -1,8 +1,8 @@
 #!/bin/sh
-# Makes scripts/report_picture.png, an image of the README: the slider of a report on a strongly compressed model.
+# Makes scripts/report_image.png, an image of the README: the slider of a report on a strongly compressed model.
 #
 #     cargo build --release
-#     scripts/report_picture.sh target/release/splatsieve DATA/room2_dynerf scripts/report_picture.png
+#     scripts/report_image.sh target/release/splatsieve DATA/room2_dynerf scripts/report_image.png
 #
 # DATA/<name> is a model folder with its cameras in it. Needs Chromium (apt-get install chromium-headless-shell),
 # or another one named in SPLATSIEVE_BROWSER.
@@ -11,7 +11,7 @@ if [ $# -ne 3 ]; then
     sed -n '2,8s/^# \{0,1\}//p' "$0" >&2
     exit 2
 fi
-splatsieve=$1 model=$2 picture=$3
+splatsieve=$1 model=$2 image=$3
 browser=${SPLATSIEVE_BROWSER:-chromium-headless-shell}
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
@@ -23,5 +23,5 @@ only='header, section:not(#compare), h2, .slider + .slider, .note { display: non
 sed "s|</head>|<style>$only</style></head>|" "$folder/report/report.html" >"$folder/slider.html"
 "$browser" --headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=620,665 \
     --screenshot="$folder/report.png" "file://$folder/slider.html" 2>/dev/null
-mkdir -p "$(dirname "$picture")"
-mv "$folder/report.png" "$picture"
+mkdir -p "$(dirname "$image")"
+mv "$folder/report.png" "$image"

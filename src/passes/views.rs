@@ -70,26 +70,26 @@ impl BatchLimits {
     /// Returns limits for many views that take little memory each: a batch has views of several frames, to keep all
     /// threads busy.
     fn many_views(limits: &Limits) -> BatchLimits {
-        let pictures = VIEWS_PER_THREAD * rayon::current_num_threads();
-        BatchLimits { frames: limits.frames_together, views: pictures, held: limits.max_kept_frames }
+        let views = VIEWS_PER_THREAD * rayon::current_num_threads();
+        BatchLimits { frames: limits.frames_together, views, held: limits.max_kept_frames }
     }
 
     /// Returns limits for views whose renders stay in memory until their batch ends: a batch has one frame, and at most
     /// one view per thread.
     pub fn one_frame(limits: &Limits) -> BatchLimits {
-        let pictures = rayon::current_num_threads().min(limits.views_together);
-        BatchLimits { frames: 1, views: pictures, held: limits.max_kept_frames }
+        let views = rayon::current_num_threads().min(limits.views_together);
+        BatchLimits { frames: 1, views, held: limits.max_kept_frames }
     }
 
-    /// Returns the number of views at the start of `pictures` that form the next batch within these limits.
-    fn batch_length(&self, pictures: &[FrameView]) -> usize {
+    /// Returns the number of views at the start of `views` that form the next batch within these limits.
+    fn batch_length(&self, views: &[FrameView]) -> usize {
         let (mut frames, mut last) = (0, None);
-        let fits = |picture: &&FrameView| {
-            frames += usize::from(last != Some(picture.frame));
-            last = Some(picture.frame);
+        let fits = |view: &&FrameView| {
+            frames += usize::from(last != Some(view.frame));
+            last = Some(view.frame);
             frames <= self.frames.max(1)
         };
-        pictures.iter().take(self.views.max(1)).take_while(fits).count()
+        views.iter().take(self.views.max(1)).take_while(fits).count()
     }
 }
 
@@ -97,7 +97,7 @@ impl BatchLimits {
 #[derive(Clone, Copy)]
 pub struct ViewStates<'a, const S: usize> {
     /// The view: its frame, view number and camera index.
-    pub picture: FrameView,
+    pub frame_view: FrameView,
     /// Camera of the view.
     pub camera: &'a Camera,
     /// Gaussians of each subject (rendered source) at the view's frame.
@@ -164,8 +164,8 @@ struct StateSlot<const S: usize> {
     features: [AttributeValues; S],
 }
 
-/// Reads the Gaussians of all `subjects` for the views `pictures` and calls `visit` with batches of these views, in
-/// order. `pictures` must be sorted by frame; their camera indices refer to `cameras`. Every frame is read once.
+/// Reads the Gaussians of all `subjects` for `views` and calls `visit` with batches of these views, in order. `views`
+/// must be sorted by frame; their camera indices refer to `cameras`. Every frame is read once.
 ///
 /// A batch has one buffer for each of its frames, which later batches use again. Attributes that do not vary in time
 /// are therefore read only once into each buffer.
@@ -177,17 +177,17 @@ struct StateSlot<const S: usize> {
 pub fn for_each_view_batch<const S: usize>(
     subjects: [RenderedSource<'_>; S],
     cameras: &[Camera],
-    pictures: &[FrameView],
+    views: &[FrameView],
     max_batch: BatchLimits,
     mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).with_max_kept_frames(max_batch.held);
+    let wanted = ReadPlan::new(views.iter().map(|view| view.frame)).with_max_kept_frames(max_batch.held);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);
     }
     let mut slots: Vec<StateSlot<S>> = Vec::new();
-    let mut rest = pictures;
+    let mut rest = views;
     while !rest.is_empty() {
         let (batch, later) = rest.split_at(max_batch.batch_length(rest));
         rest = later;
@@ -218,18 +218,18 @@ pub fn for_each_view_batch<const S: usize>(
             slot.frame = frame;
         }
         let frames = batch.chunk_by(|a, b| a.frame == b.frame).zip(&slots);
-        let views: Vec<ViewStates<'_, S>> = frames
+        let view_states: Vec<ViewStates<'_, S>> = frames
             .flat_map(|(frame_views, StateSlot { states, features, .. })| {
                 let decoded = std::array::from_fn(|k| Some((subjects[k].decoder()?, &features[k])));
-                frame_views.iter().map(move |&picture| ViewStates {
-                    picture,
-                    camera: &cameras[picture.camera as usize],
+                frame_views.iter().map(move |&frame_view| ViewStates {
+                    frame_view,
+                    camera: &cameras[frame_view.camera as usize],
                     states: states.each_ref(),
                     decoded,
                 })
             })
             .collect();
-        visit(&views)?;
+        visit(&view_states)?;
     }
     Ok(())
 }
@@ -253,9 +253,9 @@ impl<W: Send> Workers<W> {
         Workers { limits, free: Mutex::default() }
     }
 
-    /// Calls `visit` once for each of the views `pictures`, on several threads. Arguments of `visit`: a worker, which
-    /// accumulates results; the Gaussians of `subject` at the frame of the view; and the camera of the view, an element
-    /// of `cameras`. `new_worker` creates a worker if all others are busy.
+    /// Calls `visit` once for each of `views`, on several threads. Arguments of `visit`: a worker, which accumulates
+    /// results; the Gaussians of `subject` at the frame of the view; and the camera of the view, an element of
+    /// `cameras`. `new_worker` creates a worker if all others are busy.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -263,18 +263,18 @@ impl<W: Send> Workers<W> {
         &mut self,
         subject: RenderedSource<'_>,
         cameras: &[Camera],
-        pictures: &[FrameView],
+        views: &[FrameView],
         new_worker: impl Fn() -> W + Sync,
         visit: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
     ) -> Result<()> {
         let workers = rayon::current_num_threads().min(self.limits.views_together);
-        for_each_view_batch([subject], cameras, pictures, BatchLimits::many_views(&self.limits), |views| {
+        for_each_view_batch([subject], cameras, views, BatchLimits::many_views(&self.limits), |batch| {
             let next = AtomicUsize::new(0);
-            (0..workers.min(views.len())).into_par_iter().with_max_len(1).for_each(|_| {
+            (0..workers.min(batch.len())).into_par_iter().with_max_len(1).for_each(|_| {
                 let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
                 let mut worker = free.unwrap_or_else(&new_worker);
                 while let Some(&ViewStates { camera, states: [state], .. }) =
-                    views.get(next.fetch_add(1, Ordering::Relaxed))
+                    batch.get(next.fetch_add(1, Ordering::Relaxed))
                 {
                     visit(&mut worker, state, camera);
                 }
@@ -298,7 +298,7 @@ mod tests {
     use crate::passes::gather_all;
 
     /// Returns the views 0 to `views` − 1 of every frame of `frames`.
-    fn pictures(frames: &[usize], views: u32) -> Vec<FrameView> {
+    fn frame_views(frames: &[usize], views: u32) -> Vec<FrameView> {
         let of_frame = |&frame: &usize| (0..views).map(move |view| FrameView { frame, view, camera: view });
         frames.iter().flat_map(of_frame).collect()
     }
@@ -307,7 +307,7 @@ mod tests {
     fn every_view_comes_once_with_its_state_for_any_batch_size() {
         let scene = DemoScene::new(1500, 9);
         let rig = scene.rig();
-        let all = pictures(&[0, 2, 3, 7, 8], 3);
+        let all = frame_views(&[0, 2, 3, 7, 8], 3);
         let expected: Vec<Gaussians> =
             (0..9).map(|frame| gather_all(&scene, frame, Attributes::all()).unwrap()).collect();
         for (frames, max_batch) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
@@ -320,20 +320,20 @@ mod tests {
                 &all,
                 batch,
                 |views| {
-                    assert!(views.len() <= max_batch.max(1), "{} pictures of at most {max_batch}", views.len());
-                    let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
+                    assert!(views.len() <= max_batch.max(1), "{} views of at most {max_batch}", views.len());
+                    let of_frames = views.chunk_by(|a, b| a.frame_view.frame == b.frame_view.frame).count();
                     assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
-                    for ViewStates { picture, camera, states: [state, places], .. } in views {
-                        assert!(**state == expected[picture.frame], "frame {}", picture.frame);
+                    for ViewStates { frame_view, camera, states: [state, places], .. } in views {
+                        assert!(**state == expected[frame_view.frame], "frame {}", frame_view.frame);
                         assert!(places.position == state.position && places.sh.is_empty());
-                        assert!(std::ptr::eq(*camera, &rig.cameras[picture.camera as usize]));
-                        seen.push(*picture);
+                        assert!(std::ptr::eq(*camera, &rig.cameras[frame_view.camera as usize]));
+                        seen.push(*frame_view);
                     }
                     Ok(())
                 },
             )
             .unwrap();
-            assert_eq!(seen, all, "{frames} frames, {max_batch} pictures");
+            assert_eq!(seen, all, "{frames} frames, {max_batch} views");
         }
     }
 
@@ -378,7 +378,7 @@ mod tests {
         for_each_view_batch(
             [RenderedSource::all_gaussians(&scene), few],
             &rig.cameras,
-            &pictures(&[0, 2], 2),
+            &frame_views(&[0, 2], 2),
             batch,
             |views| {
                 for view in views {
@@ -417,7 +417,7 @@ mod tests {
             for_each_view_batch(
                 [RenderedSource::all_gaussians(&container)],
                 &rig.cameras,
-                &pictures(&[1, 4], views),
+                &frame_views(&[1, 4], views),
                 batch,
                 |_| Ok(()),
             )
