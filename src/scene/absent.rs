@@ -1,9 +1,9 @@
 //! Absent Gaussians: Gaussians that are dropped because some of their values are NaN or infinite. They are invisible in
 //! every frame that is read.
 //!
-//! Ids do not change. An absent Gaussian keeps its row in the arrays, but with invisible values ([`clear_row`]). So
-//! renders, contributions, removal errors, statistics and bounds are those of the other Gaussians. Memory: 4 bytes per
-//! absent Gaussian, and as many again in every reader.
+//! Ids do not change. An absent Gaussian keeps its row in the arrays, but its values are replaced by invisible ones
+//! ([`clear_row`]). So it has no effect on renders, contributions, removal errors, statistics and bounds of the other
+//! Gaussians. Memory: 4 bytes per absent Gaussian, and as many again in every reader.
 
 use std::sync::{Arc, PoisonError, RwLock};
 

@@ -5,8 +5,10 @@ use crate::model::Camera;
 
 /// Returns `count` cameras on a path from the first to the last of the cameras `stops`, through all of them in order.
 /// Between two stops, rotation, distance from the point where the optical axes meet, focal length and principal point
-/// are interpolated evenly. The steps from camera to camera are equally long. If all stops are at one position, there
-/// are equally many steps between any two successive stops. All images have the size of the first stop's image.
+/// are interpolated evenly. All images have the size of the first stop's image.
+///
+/// The steps from camera to camera are equally long, measured on straight lines between the stops. If all stops are at
+/// one position, there are equally many steps between any two successive stops.
 pub fn cameras_along(stops: &[Camera], count: usize) -> Vec<Camera> {
     let (Some(first), Some(last)) = (stops.first(), stops.last()) else { return Vec::new() };
     let focus = meeting_point(stops);

@@ -41,11 +41,11 @@ pub struct Scene {
     pub input: Box<dyn InputModel>,
     /// Cameras and the views they took, of all splits (training, validation, test).
     pub rig: Rig,
-    /// Views at each frame: from the cameras of the chosen split and, if these were added, from cameras outside the rig
-    /// (in directions from which no camera of the rig sees the scene).
+    /// Views at each frame: those of the cameras of the chosen split, and those of cameras outside the rig if these
+    /// were added. A camera is outside the rig if it sees the scene from a new direction.
     pub schedule: ViewSchedule,
-    /// Weight of the quality of renders from outside the directions of the rig's cameras, from 0 (not considered) to 1.
-    /// It is the argument `reach` of [`Scene::add_outside_views`]; 0 if no such views were added.
+    /// Weight, from 0 (ignored) to 1, of the quality of renders from directions in which the rig has no cameras. It is
+    /// the argument `reach` of [`Scene::add_outside_views`]; 0 if no such views were added.
     pub outside: f64,
     /// Whether the views show the whole scene: cameras were given or found, or were placed all around a scene of one
     /// frame. Otherwise the cameras are a virtual rig, which may see only what is in front of it, such as the outside
@@ -59,8 +59,8 @@ pub struct Scene {
     /// Maximum number of times that the run reads the whole input, according to the memory plan that set `limits`;
     /// `None` before a plan is made.
     pub planned_reads: Option<f64>,
-    /// Measured times of this machine for this scene, as multiples of the times assumed for planning. Later stages
-    /// estimate their time with these factors.
+    /// Measured times of this machine for this scene, as multiples of the times that are assumed for planning. Later
+    /// stages multiply their estimates by these factors.
     pub pace: Throughput,
     /// Folder for temporary files during the run.
     pub scratch: PathBuf,
@@ -112,7 +112,8 @@ impl Scene {
         Workload { throughput: self.pace, ..work }
     }
 
-    /// Plans the memory of the stages that `needs` describes, and makes this scene keep to the limits of the plan.
+    /// Plans the memory of the stages whose estimates `needs` returns, and makes this scene keep to the limits of the
+    /// plan.
     ///
     /// # Errors
     /// Fails if the stages do not fit into the memory budget under any limits.

@@ -91,8 +91,8 @@ fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<
 }
 
 /// Returns evenly spaced frame times from 0 up to but not including `span`, for a model whose cameras give no times.
-/// `given` is the number of frames that the user gave; if it is `None`, a default is used and a message about this is
-/// added to `notes`.
+/// `given` is the number of frames that the user asked for. If it is `None`, uses [`DEFAULT_FRAMES`] and adds a message
+/// about this to `notes`.
 ///
 /// # Errors
 /// Fails if the number of frames is not from 1 to 1,000,000.
@@ -223,8 +223,8 @@ pub fn first_frame_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     Ok(Some(RobustBox::from_positions(&gather_all(source, 0, Attributes::POSITION)?.position)))
 }
 
-/// Returns the folder for temporary files of a run that writes `output`: the folder that contains the output, since a
-/// disk with space for the output also has space for a temporary copy of packed input. Returns `None` if `output` is a
+/// Returns the folder for temporary files of a run that writes `output`: the folder that contains the output. A disk
+/// with space for the output also has space for a temporary copy of packed input. Returns `None` if `output` is a
 /// device or a FIFO.
 pub fn scratch_beside(output: &Path) -> Option<PathBuf> {
     if std::fs::metadata(output).is_ok_and(|found| !found.is_file() && !found.is_dir()) {

@@ -98,8 +98,8 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
     Ok(OpenedInput { input: Box::new(input), rig, notes })
 }
 
-/// Returns the quota for the frames of a stream with the header `header`: a counter of arriving frames that fails as
-/// soon as there are more than can be packed within the memory budget.
+/// Returns the quota for the frames of a stream with the header `header`: a counter of arriving frames, which fails as
+/// soon as more frames have arrived than fit into the memory budget.
 ///
 /// # Errors
 /// Fails if the memory budget is too small for one block of frames (consecutive frames that the container stores
@@ -168,15 +168,16 @@ impl FrameQuota {
     }
 }
 
-/// Bytes of memory per frame while a stream is packed: its time stamp and, if statistics are computed, the number of
-/// Gaussians alive (opacity ≥ alpha_min) in it. Both are in lists that grow by being copied to twice their length.
+/// Bytes of memory per frame while a stream is packed: the frame's time stamp and, if statistics are computed, its
+/// number of Gaussians alive (opacity ≥ alpha_min). Both are counted twice, because they are in lists that grow by
+/// being copied to twice their length.
 const PER_FRAME: u64 = 2 * (8 + 4);
 
 /// Estimates the memory of packing a stream of `frames` frames, of which `held` are in memory at a time. `measuring`
-/// tells what else is done as frames arrive:
+/// states what else is computed as frames arrive:
 /// - `None`: nothing.
 /// - `Some(false)`: statistics.
-/// - `Some(true)`: statistics, and renders of views.
+/// - `Some(true)`: statistics, and contributions to rendered views.
 pub fn receiving_estimate(
     work: &Workload,
     limits: &Limits,

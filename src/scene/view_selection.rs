@@ -103,9 +103,9 @@ pub fn select_frames(views: Vec<FrameView>, count: usize) -> Vec<FrameView> {
 /// Returns at most `most` of `views`, spread evenly over frames and view numbers. `views` must be sorted by frame, then
 /// view.
 ///
-/// The views are picked at equal distances from a list of all views, ordered by frame. In this list, the views of the
-/// n-th frame are shifted cyclically among themselves, by this fraction of their number: the fractional part of n times
-/// the golden ratio. Without the shift, the same view numbers would be picked again and again.
+/// The views are picked at equal distances from a list of all views, ordered by frame. In this list, the m views of the
+/// n-th frame are rotated cyclically by m · frac(n · φ) places, where φ is the golden ratio and frac the fractional
+/// part. Without this rotation, the same view numbers would be picked again and again.
 pub fn spread_views(views: Vec<FrameView>, most: usize) -> Vec<FrameView> {
     let (count, most) = (views.len(), most.max(1));
     if count <= most {

@@ -8,9 +8,9 @@ use crate::model::Camera;
 /// Smallest distance of a new camera from either of the two cameras between which it is placed, as a fraction of the
 /// path between these two.
 const MIN_FRACTION: f64 = 0.15;
-/// Limit for placing a new camera between two cameras: the cosine of the angle between their directions, as seen from
-/// the point where the optical axes meet, must be above this value. So the angle is at most about 127°. Halfway between
-/// opposite cameras, the viewing direction would be undefined.
+/// A new camera is placed between two cameras if the cosine of the angle between their directions, as seen from the
+/// point where the optical axes meet, is above this value. So the angle is at most about 127°. Halfway between opposite
+/// cameras, the viewing direction would be undefined.
 const MIN_COSINE: f64 = -0.6;
 
 /// Returns `count` new cameras, each at a random place on a path between two of `cameras`. Along a path, rotation and
@@ -52,7 +52,8 @@ pub(super) fn interpolated_camera(from: &Camera, to: &Camera, fraction: f64, foc
     let distance = start.length() * (1.0 - fraction) + end.length() * fraction;
     // If the path passes through the focus, the center is interpolated linearly.
     let center = focus + linear.try_normalize().map_or(linear, |direction| direction * distance);
-    // On a wide path, even rotation alone would turn the focus out of sight, so the camera is turned back toward it.
+    // If the two cameras are far apart, even rotation alone would turn the focus out of sight, so the camera is turned
+    // back toward it.
     let seen = |camera: &Camera| (camera.rotation * (focus - camera.center())).normalize_or_zero();
     let wanted = seen(from).lerp(seen(to), fraction).normalize_or_zero();
     let direction = (rotated * (focus - center)).normalize_or_zero();
@@ -62,8 +63,8 @@ pub(super) fn interpolated_camera(from: &Camera, to: &Camera, fraction: f64, foc
     Camera { rotation, translation: -(rotation * center), ..from.clone() }
 }
 
-/// Returns the point nearest to the optical axes of all cameras in the least-squares sense; for parallel axes, the mean
-/// of the camera positions.
+/// Returns the point at which the optical axes of all cameras meet: the point nearest to all of them in the
+/// least-squares sense. For parallel axes, returns the mean of the camera positions.
 pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
     let (mut matrix, mut right, mut middle) = (DMat3::ZERO, DVec3::ZERO, DVec3::ZERO);
     for camera in cameras {

@@ -21,7 +21,7 @@ const MAX_CAMERAS: usize = 64;
 /// camera and the nearest direction in the cone of the rig ([`RigCone`]).
 pub const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
 /// Maximum number of random cameras that are tried for each wanted camera outside the rig.
-const TRIES: usize = 64;
+const TRIES_PER_CAMERA: usize = 64;
 /// Maximum number of iterations in [`RigCone::angle`], which searches a cone for the direction nearest to a given one.
 /// Each iteration adds the direction of one camera to a weighted sum that approaches the given direction.
 const MAX_DIRECTIONS: usize = 64;
@@ -29,11 +29,11 @@ const MAX_DIRECTIONS: usize = 64;
 /// - The search ends if the remainder (given direction minus the nearest point of the cone found so far) has a dot
 ///   product of at most this value with every camera direction of the cone.
 /// - Vectors count as linearly dependent if the absolute value of their determinant is at most this value.
-const EXACT_ENOUGH: f64 = 1e-12;
+const ANGLE_TOLERANCE: f64 = 1e-12;
 /// Tolerance for the faces of a cone, with two uses:
 /// - A direction is on a face if the sine of its angle to the face is below this value.
 /// - Two faces are the same if their unit normals are at most this distance apart.
-const FLAT: f64 = 1e-6;
+const FACE_TOLERANCE: f64 = 1e-6;
 
 /// Directions from which the cameras of a rig see the scene: the convex cone of the directions from the point where
 /// their optical axes meet to the cameras.
@@ -75,8 +75,8 @@ impl RigCone {
         let pairs = (0..all.len()).flat_map(|i| (0..all.len()).filter(move |&j| j != i).map(move |j| (i, j)));
         let normals = pairs.filter_map(|(i, j)| all[i].cross(all[j]).try_normalize());
         let mut faces: Vec<DVec3> = Vec::new();
-        for normal in normals.filter(|normal| all.iter().all(|own| normal.dot(*own) > -FLAT)) {
-            if faces.iter().all(|face| face.distance(normal) > FLAT) {
+        for normal in normals.filter(|normal| all.iter().all(|own| normal.dot(*own) > -FACE_TOLERANCE)) {
+            if faces.iter().all(|face| face.distance(normal) > FACE_TOLERANCE) {
                 faces.push(normal);
             }
         }
@@ -101,7 +101,7 @@ impl RigCone {
         for _ in 0..MAX_DIRECTIONS {
             let gain = |own: &&DVec3| own.dot(rest);
             let best = self.directions.iter().max_by(|a, b| gain(a).total_cmp(&gain(b)));
-            let Some(best) = best.filter(|own| gain(own) > EXACT_ENOUGH) else { break };
+            let Some(best) = best.filter(|own| gain(own) > ANGLE_TOLERANCE) else { break };
             used.push((*best, 0.0));
             if !fit_weights(&mut used, direction) {
                 break;
@@ -112,14 +112,14 @@ impl RigCone {
     }
 }
 
-/// Changes the weights in `used`, which has pairs of a unit vector and its weight. Afterwards, the weighted sum of the
-/// vectors is as near to `direction` as weights of at least 0 allow. Removes vectors whose weight is 0. Returns false
-/// if the vectors are linearly dependent.
+/// Sets the weights in `used` (pairs of a unit vector and its weight) to the weights ≥ 0 for which the weighted sum of
+/// the vectors is nearest to `direction`. Removes vectors whose weight is 0. Returns false if the vectors are linearly
+/// dependent.
 fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(used, direction) else { return false };
-        // Fraction of the way from the present weights to the weights of any sign (`free`) at which the first weight
-        // becomes 0.
+        // Fraction of the change from the present weights to `free`, the best weights of any sign, at which the first
+        // weight becomes 0.
         let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| (free <= 0.0).then(|| weight / (weight - free));
         let step = used.iter().zip(&free).filter_map(limit).fold(1.0, f64::min);
         used.iter_mut().zip(&free).for_each(|((_, weight), free)| *weight += step * (free - *weight));
@@ -140,12 +140,12 @@ fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
             let (cosine, to_a, to_b) = (a.dot(b), a.dot(direction), b.dot(direction));
             let determinant = 1.0 - cosine * cosine;
             let weights = || vec![(to_a - cosine * to_b) / determinant, (to_b - cosine * to_a) / determinant];
-            (determinant > EXACT_ENOUGH).then(weights)
+            (determinant > ANGLE_TOLERANCE).then(weights)
         }
         [(a, _), (b, _), (c, _)] => {
             let matrix = DMat3::from_cols(a, b, c);
             let weights = || (matrix.inverse() * direction).to_array().to_vec();
-            (matrix.determinant().abs() > EXACT_ENOUGH).then(weights)
+            (matrix.determinant().abs() > ANGLE_TOLERANCE).then(weights)
         }
         _ => None,
     }
@@ -155,8 +155,9 @@ fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
 ///
 /// - Each starts as one of `cameras`, or as a camera between two of them. It is then turned about the point where the
 ///   optical axes meet, away from the mean direction of the rig. This multiplies its angle from the mean direction by a
-///   random factor from 1 to `max_factor`.
-/// - There are fewer than `count` if hardly any direction is outside the rig, as for a rig all around the scene.
+///   random factor from 1 to `max_factor`, but the angle at most doubles and never exceeds 180°.
+/// - There are fewer than `count` cameras if hardly any direction is outside the rig, as for a rig all around the
+///   scene.
 /// - There are none for parallel cameras.
 pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
     let cone = RigCone::new(cameras);
@@ -164,7 +165,7 @@ pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec
     let bases = [cameras, &cameras_between(cameras, count)].concat();
     let mut random = SplitMix64(3);
     let mut found = Vec::with_capacity(count);
-    for _ in 0..count * TRIES {
+    for _ in 0..count * TRIES_PER_CAMERA {
         if found.len() == count {
             break;
         }
