@@ -1,7 +1,7 @@
 //! Effort of a run: one option that trades time for quality. Its values were chosen from measurements of error against
 //! run time (`splatsieve precision`).
 
-use super::{MOST_STEPS, Recipe};
+use super::{MAX_STEPS, Recipe};
 
 /// Effort of a run: trades run time for quality.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,13 +60,14 @@ impl Effort {
 }
 
 impl Recipe {
-    /// Returns this recipe at `effort`: with more or fewer scored views, pruning rounds and optimization steps. Turns
-    /// on nothing that the recipe has turned off. A recipe that scores all views still scores all.
+    /// Returns this recipe at `effort`: with fewer or more scored views, pruning rounds and optimization steps. Parts
+    /// of the method that the recipe turns off stay off, and a recipe that scores all views still scores all.
     pub fn with_effort(&self, effort: Effort) -> Recipe {
         let Some(settings) = effort.settings() else { return self.clone() };
         let steps = settings.steps * f64::from(self.refine.refine_steps);
-        let mut recipe = self.with_refinement_steps((steps.ceil() as u32).min(MOST_STEPS));
-        // Effort `fast` never raises a value of the recipe, and effort `best` never lowers one.
+        let mut recipe = self.with_refinement_steps((steps.ceil() as u32).min(MAX_STEPS));
+        // Effort `fast` never raises a value of the recipe, and effort `best` never lowers one, except that neither
+        // raises the number of groups.
         let less = settings.steps < 1.0;
         let limited = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
         if recipe.scan.scoring_views > 0 {

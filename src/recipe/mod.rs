@@ -35,9 +35,9 @@ pub const PRESETS: [(&str, &str); 4] = [
 /// Gaussians down to a few takes about 1300 rounds.
 pub const MAX_ROUND_FRACTION: f64 = 0.99;
 /// Maximum number of optimization steps of refinement; these take about one day.
-const MOST_STEPS: u32 = 1_000_000;
+const MAX_STEPS: u32 = 1_000_000;
 /// Maximum number of merge passes. Every pass reads all frames, so more passes would make a run endless.
-const MOST_PASSES: usize = 16;
+const MAX_PASSES: usize = 16;
 
 /// Parameters of the method; `paper.toml` documents each of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -161,12 +161,12 @@ impl Recipe {
                 (1..=1000).contains(&self.select.round_groups),
                 "1 to 1000",
             ),
-            ("refine.refine_steps", refine_steps.into(), refine_steps <= MOST_STEPS, "0 to 1000000"),
-            ("refine.refine_steps_per_prune", steps_per_prune.into(), steps_per_prune <= MOST_STEPS, "0 to 1000000"),
+            ("refine.refine_steps", refine_steps.into(), refine_steps <= MAX_STEPS, "0 to 1000000"),
+            ("refine.refine_steps_per_prune", steps_per_prune.into(), steps_per_prune <= MAX_STEPS, "0 to 1000000"),
             (
                 "merge.passes",
                 self.merge.passes.len() as f64,
-                self.merge.passes.len() <= MOST_PASSES,
+                self.merge.passes.len() <= MAX_PASSES,
                 "at most 16 passes",
             ),
             (
@@ -219,11 +219,11 @@ pub fn preset_text(name: &str) -> Result<&'static str> {
     }
 }
 
-/// Returns the parameters in `over`, completed by those of a preset. The preset is the one that the key `preset` of
-/// `over` names, otherwise `fallback`. It may itself be based on another preset.
+/// Returns the parameters in `over`, and for all others the values of a preset. The preset is the one that the key
+/// `preset` of `over` names, otherwise `fallback`. It may itself be based on another preset.
 ///
-/// Returns only the parameters in `over` if it names no preset and there is no fallback. Fails if the named preset does
-/// not exist.
+/// Without any preset (`over` names none and `fallback` is `None`), returns only the parameters in `over`. Fails if the
+/// named preset does not exist.
 fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Result<toml::Table, String> {
     over.remove("provenance");
     over.remove("run");
@@ -282,7 +282,7 @@ mod tests {
 
     #[test]
     fn values_that_make_a_run_endless_are_refused() {
-        let many = "[[merge.passes]]\nepsilon = 0.01\nd0 = 1.0\nrho = 0.9\ntau_m = 0.9\n".repeat(MOST_PASSES + 1);
+        let many = "[[merge.passes]]\nepsilon = 0.01\nd0 = 1.0\nrho = 0.9\ntau_m = 0.9\n".repeat(MAX_PASSES + 1);
         for (text, parts) in [
             ("[select]\nround_fraction = 0.9999999999\n", ["select.round_fraction", "0.01 to 0.99, or 1"]),
             ("[refine]\nrefine_steps = 4000000000\n", ["refine.refine_steps", "0 to 1000000"]),

@@ -42,9 +42,9 @@ pub enum ScanFrames {
 #[serde(rename_all = "lowercase")]
 pub enum MotionParams {
     /// Motion as the paper defines it. Every step from one frame to the next counts if the Gaussian is alive (opacity ≥
-    /// alpha_min) in the second frame, even if it is not alive in the first. For the mean, the sum over the steps is
-    /// divided by the number of frames in which the Gaussian is alive. For the curvature, the sum over the turns
-    /// (changes from one step to the next) is divided by this number minus 2.
+    /// alpha_min) in the second frame, even if it is not alive in the first. Let n be the number of frames in which the
+    /// Gaussian is alive. For the mean, the sum over the steps is divided by n. For the curvature, the sum over the
+    /// turns (changes from one step to the next) is divided by n − 2.
     Literal,
     /// A step from one frame to the next counts only if the Gaussian is alive (opacity ≥ alpha_min) in both frames. For
     /// the mean, the sum over the steps is divided by their number.
@@ -98,7 +98,7 @@ pub struct ScoreParams {
     pub clip_norm: bool,
 }
 
-/// First term of the static score S_static (importance of a Gaussian without regard to its motion).
+/// First term of the static score S_static, which rates a Gaussian without regard to its motion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StaticScoreTerm {
@@ -313,8 +313,8 @@ impl LengthUnit {
     }
 }
 
-/// Formula that tells how alike the motions of two Gaussians are (1: equal). a and b are their steps from one frame to
-/// the next.
+/// Formula of the motion similarity of two Gaussians; 1 means equal motion. a and b are the steps of the two Gaussians
+/// from one frame to the next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionSimilarity {
