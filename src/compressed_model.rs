@@ -23,22 +23,21 @@ pub struct Cluster {
     pub output: u32,
     /// Id of the leader of this cluster: the Gaussian to which merging joined the other members.
     pub leader: u32,
-    /// Members (Gaussians) of this cluster, including the leader (the one that the others are merged into): pairs of
-    /// the id of a Gaussian and its weight, in increasing order of ids. The proxy is the weighted mean of the members;
-    /// the weights sum to 1.
+    /// Ids and weights of the members of this cluster, in increasing order of ids. The leader is one of the members.
+    /// The proxy is the weighted mean of the members; the weights sum to 1.
     pub members: Vec<(u32, f64)>,
 }
 
 /// Proxies (Gaussians that each replace a merged cluster), computed before anything is written.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Proxies {
-    /// Stored parameters of the proxies (Gaussians that replace merged clusters), one row per cluster, in a model
-    /// format that stores a proxy as it stores any Gaussian. `None`: proxies have no stored parameters; each is
-    /// computed from its members at each frame.
+    /// Stored parameters of the proxies (Gaussians that replace merged clusters), one row per cluster. `None` if the
+    /// model format cannot store a proxy like any other Gaussian: each proxy is then computed from its members at each
+    /// frame.
     pub raw: Option<StoredParams>,
-    /// Increasing indices of the clusters whose proxy (the Gaussian to replace the cluster) was refused, because no
+    /// Increasing indices of the clusters whose proxy (Gaussian to replace the cluster) was refused, because no
     /// Gaussian of the model format moves and fades like the members together. Such a cluster is not merged: its leader
-    /// (most important member) stays, the other members are removed.
+    /// (most important member) stays, and the other members are removed.
     pub refused: Vec<usize>,
     /// Largest distance between the position of a proxy (Gaussian that replaces a merged cluster) and the position
     /// expected from its members (the Gaussians of the cluster), over all proxies and sampled frames, scene units.
@@ -175,9 +174,9 @@ impl TrajectoryDelta {
 /// Compressed model: describes every Gaussian of the output by the Gaussians of the input that it comes from.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CompressedModel {
-    /// For every Gaussian of the output, in order, the id of an input Gaussian: the Gaussian itself if it is unmerged;
-    /// if it is a proxy (Gaussian that replaces a merged cluster), the leader (most important member) of its cluster.
-    /// The ids increase.
+    /// For every Gaussian of the output, in order, the id of an input Gaussian. For an unmerged Gaussian it is the
+    /// Gaussian itself. For a proxy (Gaussian that replaces a merged cluster) it is the leader (most important member)
+    /// of its cluster. The ids increase.
     pub kept: Vec<u32>,
     /// Clusters of input Gaussians that are merged, in increasing order of the index in the output of their proxy (the
     /// Gaussian that replaces the cluster).
@@ -192,8 +191,8 @@ pub struct CompressedModel {
     #[serde(rename = "change")]
     pub delta: ParamDelta,
     /// Trajectory delta: values that refinement adds to the attributes at each frame, on top of the constant `delta`.
-    /// It has values only in a model that meets two conditions: its format stores the state of every Gaussian for every
-    /// frame, and no Gaussians are merged.
+    /// It has values only if the model format stores the state of every Gaussian for every frame, and no Gaussians are
+    /// merged.
     #[serde(rename = "course")]
     pub trajectory_delta: TrajectoryDelta,
     /// Precision in which the deformation field is written, if the model has one.

@@ -41,7 +41,7 @@ impl Limits {
     };
 }
 
-/// Limit on the bytes of memory that reading an input may take, without the memory of the program itself.
+/// Maximum number of bytes of memory that reading an input may take, without the memory of the program itself.
 ///
 /// Readers check this limit before they allocate memory for a length given in a file. If the file gives no length, they
 /// check it while they read.
@@ -70,8 +70,8 @@ impl ReadLimit {
         self.bytes
     }
 
-    /// Checks that `bytes` bytes of memory are within this limit. `what` names their purpose, as in "the rows of the
-    /// header".
+    /// Checks that `bytes` bytes of memory are within this limit. `what` names the purpose of the memory, as in "the
+    /// rows of the header".
     ///
     /// # Errors
     /// Fails if `bytes` exceeds the limit. The error names the file `path`, the place `place` in it, and the option

@@ -44,7 +44,7 @@ impl Ids<'_> {
 }
 
 /// Plan of the frames that the caller will read from a reader. The plan saves time: the reader decodes a tile (some
-/// Gaussians at consecutive frames) once, and keeps only the planned frames of it.
+/// Gaussians at consecutive frames) once, and keeps only the planned frames of it for later reads.
 #[derive(Debug, Clone)]
 pub struct ReadPlan {
     /// Frames that will be read, in increasing order; `None` means every frame.
@@ -67,9 +67,9 @@ impl ReadPlan {
         ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
-    /// Returns a copy of this plan with the limit `frames` (at least 1) on the frames that a reader keeps in memory. A
-    /// reader that decodes a tile gets several consecutive frames at once, and keeps them for later reads. A small
-    /// limit saves memory but makes the reader decode tiles repeatedly.
+    /// Returns a copy of this plan in which a reader keeps at most `frames` frames (at least 1) in memory. A reader
+    /// that decodes a tile gets several consecutive frames at once, and keeps them for later reads. A small limit saves
+    /// memory but makes the reader decode tiles repeatedly.
     pub fn with_max_kept_frames(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
@@ -123,7 +123,7 @@ impl Add for Reads {
 impl Sub for Reads {
     type Output = Reads;
 
-    /// Returns the amounts read between two counts of one source: `before`, the earlier count, and `self`, the later
+    /// Returns the amounts read between two counts of the same source. `self` is the later count, `before` the earlier
     /// one.
     fn sub(self, before: Reads) -> Reads {
         Reads {
@@ -174,14 +174,14 @@ pub trait FrameSource: Send + Sync {
     }
 
     /// Returns the function that computes the states of Gaussians from stored parameters. Returns `None` for models
-    /// that store the state at every frame (explicit trajectories). For these, an optimizer adds the change of a
-    /// parameter to the states at all frames.
+    /// that store the state at every frame (explicit trajectories). For such a model, an optimizer that changes a
+    /// parameter adds the change to the states at all frames.
     fn deformation(&self) -> Option<&dyn Deformation> {
         None
     }
 
-    /// Returns the decoder of pixel colors for models that store features in place of colors, and `None` for models
-    /// that store colors. With a decoder, the colors in a frame state only approximate the renders.
+    /// Returns the decoder that computes pixel colors, for models that store features in place of colors; `None` for
+    /// models that store colors. With a decoder, the colors in a frame state only approximate the colors of renders.
     fn decoder(&self) -> Option<&dyn FeatureDecoder> {
         None
     }
@@ -267,7 +267,7 @@ pub trait BlockReader: Send {
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
     /// Decodes the attributes `_want` at frame `_frame`, and at the other frames of the same tile (frames that are
-    /// stored and decoded together). Later calls of [`BlockReader::read`] then only have to copy values. Decodes
+    /// stored and decoded together), so that later calls of [`BlockReader::read`] only have to copy values. Decodes
     /// nothing for frames that the reader may not keep in memory.
     fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
