@@ -85,7 +85,7 @@ fn compress_whole(request: &Request) -> Result<Summary> {
 }
 
 /// Compresses the open scene `scene` as `request` asks and writes the result, like [`compress`]. Returns the summary of
-/// the run, and for every input Gaussian its index in the output (`None` if it was removed).
+/// the run and the index map: for every input Gaussian its index in the output (`None` if it was removed).
 ///
 /// # Errors
 /// Fails in the cases in which [`compress`] fails. A run of only one shard (part of a divided stage) ends with
@@ -110,8 +110,8 @@ pub fn shardable_stages(request: &Request) -> Result<Vec<String>> {
     Ok(plan.shardable_units(&scene))
 }
 
-/// Sets how many frames, views and pairs of Gaussians the stages of a run of `request` may keep in memory at a time,
-/// and stores these limits in the open scene `scene`. With them, the run stays within the memory budget of `request`.
+/// Plans the memory of the run of `request`: sets how many frames, views and pairs of Gaussians its stages may keep in
+/// memory at a time, so that the run stays within the memory budget of `request`. Stores these limits in `scene`.
 ///
 /// # Errors
 /// Fails if the budget is too small for the run, and in the cases in which [`RunPlan::new`] fails.
@@ -120,9 +120,9 @@ pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<
     scene.plan_memory(request.input.memory, |work, limits| plan.estimates(work, limits))
 }
 
-/// Computes the statistics of the Gaussians of `scene`, scores the Gaussians and selects the survivors (Gaussians that
-/// are not removed) by the parameters of `recipe`. Returns the statistics and the selection; [`Scored::scores`]
-/// computes the scores again. `user` states which Gaussians the user wants to keep or to drop in any case.
+/// Computes the statistics and scores of the Gaussians of `scene`, and selects the survivors (Gaussians that are not
+/// removed) by the parameters of `recipe`. Returns the statistics and the selection; the scores can be computed again
+/// with [`Scored::scores`]. `user` states which Gaussians the user wants to keep or to drop in any case.
 ///
 /// # Errors
 /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
@@ -130,9 +130,9 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Resu
     MeasureStages::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
 }
 
-/// Runs the stages of `plan`, one after the other. `arrived` holds the statistics of the Gaussians if these were
-/// already computed while the input, a stream, arrived. Returns the summary of the run, and for every input Gaussian
-/// its index in the output (`None` if it was removed).
+/// Runs the stages of `plan`, one after the other. `arrived` holds the statistics of the Gaussians if the input is a
+/// stream and they were already computed while it arrived. Returns the summary of the run and the index map: for every
+/// input Gaussian its index in the output (`None` if it was removed).
 fn run_stages(
     scene: &Scene,
     plan: &RunPlan,

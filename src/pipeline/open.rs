@@ -42,8 +42,8 @@ use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
 /// Opens the scene that `options` describe, and limits what the stages of the run keep in memory, so that the run stays
-/// within the memory budget. The function `plan` makes the plan of the run from facts about the scene. The input
-/// determines when it is called:
+/// within the memory budget. The function `plan` makes the plan of the run from facts about the scene. It is called at
+/// a time that depends on the input:
 /// - stream: before any frame is read;
 /// - stream whose Gaussians have to be matched between frames ([`is_linked`]): after all frames are read;
 /// - other input: after it is opened.
@@ -100,7 +100,7 @@ fn send_forecast(
     journal: &mut Journal,
 ) -> Result<()> {
     let tell = options.memory.tell;
-    // A run of one shard cannot tell which fraction of the whole run it does, so it has no forecast.
+    // A process that runs only one shard does not know which fraction of the whole run it does, so it has no forecast.
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
     if tell == Verbosity::Plan && stages.output.is_some() {
         options.events.send(Message::Plan(&stages.text()));
@@ -161,7 +161,7 @@ fn receive_measured(
     let to_measure =
         FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
     announce_limits(options, memory.peak_bytes(), quota.most, to_measure);
-    // Without cameras the virtual rig is placed around the first frame; the plan of the scan follows from the rig.
+    // Without cameras, a virtual rig is placed around the first frame. The plan of the scan is made from the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
         let _ = rig.set(loaded);
@@ -213,8 +213,8 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// Sends a message about memory before a stream is received. What the user asked for determines its content:
-/// - forecast ([`Verbosity::Time`]): `peak`, the maximum memory of the run, bytes;
+/// Sends a message about memory before a stream is received. Its content depends on what the user asked for:
+/// - forecast ([`Verbosity::Time`]): `peak`, the maximum memory of the run in bytes;
 /// - plan ([`Verbosity::Plan`]): `most`, the maximum number of frames that fit the memory limit, and `to_measure`, the
 ///   maximum number of frames for which memory suffices to compute statistics while they arrive;
 /// - nothing ([`Verbosity::Nothing`]): no message is sent.
@@ -231,9 +231,9 @@ fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64
     options.events.send(Message::Plan(&text));
 }
 
-/// Completes the statistics that were computed while the frames of a stream arrived, and returns them. Returns `None`
-/// if they cannot be used: an assumption about the times of the stream proved wrong, or Gaussians with NaN or infinity
-/// have to be dropped. Then adds the reason as a note to `scene`.
+/// Completes the statistics that were computed while the frames of a stream arrived, and returns them. If they cannot
+/// be used, adds the reason as a note to `scene` and returns `None`. There are two reasons: an assumption about the
+/// times of the stream proved wrong, or Gaussians with NaN or infinity have to be dropped.
 fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &mut Scene) -> Result<Option<Measured>> {
     let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
     let found = match measuring.failed_assumption(&complete, scene) {

@@ -203,9 +203,10 @@ impl RunPlan {
         self.estimates_where(input, |stage| !stage.is_optional())
     }
 
-    /// Returns the resource estimates (memory, time, reads) of the stages that certainly have to run. Leaves out stages
-    /// that are unnecessary if the run removes only Gaussians that hardly change renders. `hardly_seen`: fraction of
-    /// the Gaussians that can be removed before the PSNR of renders falls below 60 dB.
+    /// Returns the resource estimates (memory, time, reads) of the stages that certainly have to run. A run that
+    /// removes only Gaussians that hardly change renders does not need all stages; the stages that may be unnecessary
+    /// are left out. `hardly_seen`: fraction of the Gaussians that can be removed before the PSNR of renders falls
+    /// below 60 dB.
     pub fn shortest_estimates(
         &self,
         work: &Workload,
@@ -273,8 +274,8 @@ impl RunPlan {
         self.output.as_ref().map_or(Ok(()), |output| output.check_target(&[input]))
     }
 
-    /// Checks, before any work, that the stages of the plan can run on the scene: that the files which they need exist,
-    /// and that the output format can store the scene.
+    /// Checks, before any work, that the stages of the plan can run on the scene: the files that they need must exist,
+    /// and the output format must be able to store the scene.
     ///
     /// # Errors
     /// Fails if files are missing or too few, or if the output format cannot store the scene.

@@ -64,8 +64,8 @@ impl Planning<'_> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
     }
 
-    /// Returns whether refinement chooses the SH degree for a requested size on disk. If so, the run refines, for each
-    /// degree, as many Gaussians as fit the size, and takes the degree with the best quality.
+    /// Returns whether the run chooses the SH degree for a requested size on disk. It then refines, for each degree, as
+    /// many Gaussians as fit the size, and takes the degree with the best quality.
     pub fn chooses_sh_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
         has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == ShDegreeRule::Needed

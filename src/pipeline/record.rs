@@ -51,16 +51,16 @@ pub struct RunOptions {
     pub mode: PruneOrMerge,
     /// Exact number of Gaussians in the output.
     pub target_count: Option<u64>,
-    /// Number of Gaussians in the output divided by the number in the input. The output has exactly the resulting
-    /// number of Gaussians, rounded.
+    /// Number of Gaussians in the output divided by the number in the input. The output has exactly the rounded product
+    /// of this ratio and the number in the input.
     pub target_ratio: Option<f64>,
     /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     pub min_psnr: Option<f64>,
     /// Maximum amount, dB, by which the mean PSNR against photographs may be lower for the output than for the original
     /// model.
     pub max_loss: Option<f64>,
-    /// Folder of the photographs for `max_loss` and `toward`. In a recipe file the path is relative to the folder of the
-    /// file.
+    /// Folder of the photographs for `max_loss` and `toward`. In a recipe file, the path is relative to the folder of
+    /// the file.
     pub ground_truth: Option<PathBuf>,
     /// Images to which the result is fitted.
     #[serde(skip_serializing_if = "FitTarget::is_renders")]

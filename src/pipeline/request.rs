@@ -28,8 +28,8 @@ pub enum PruneOrMerge {
 pub enum Target {
     /// Exact number of Gaussians.
     Count(u64),
-    /// Number of Gaussians in the output divided by that in the input, above 0 and at most 1. The resulting number of
-    /// Gaussians is rounded to the nearest one, at least 1.
+    /// Number of Gaussians in the output divided by that in the input, above 0 and at most 1. The number in the output
+    /// is rounded to the nearest integer, and is at least 1.
     Ratio(f64),
 }
 

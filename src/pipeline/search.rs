@@ -2,10 +2,10 @@
 //! Gaussians.
 //!
 //! Sizes (numbers of Gaussians) are tried one after the other; each model is refined as if its size had been requested.
-//! The next size is computed from the surplus of quality at the last sizes, and lies between the largest size that
-//! failed and the smallest that passed. The states of refinement after prune steps (removals of the lowest-ranked
-//! Gaussians) are kept, so that a smaller size continues from one of them. A quarter of the views is never used by the
-//! search and gives the reported quality (method.md, section 6.3).
+//! The next size lies between the largest size that failed and the smallest that passed, and is computed from the
+//! surpluses of quality at the tried sizes. The models after prune steps (removals of the lowest-ranked Gaussians) are
+//! kept, so that the refinement of a smaller model continues from one of them. A quarter of the views is never used by
+//! the search and gives the reported quality (method.md, section 6.3).
 
 use std::num::NonZeroU32;
 
@@ -47,15 +47,15 @@ const SIZES_USUALLY_TRIED: f64 = 4.0;
 /// Maximum number of sizes (numbers of Gaussians) that are tried. If all of them fail, the model of all Gaussians in
 /// the ranking is tried as well; the ranking leaves out Gaussians that are always dropped.
 const MAX_SIZES: usize = 8;
-/// Ratio of two sizes (numbers of Gaussians) at which the search ends: the smallest size with the requested quality,
-/// divided by the largest size without it.
+/// The search ends when the smallest size (number of Gaussians) with the requested quality, divided by the largest size
+/// without it, is at most this ratio.
 const SAME_SIZE_RATIO: f64 = 1.04;
-/// Approximate cost of halving the number of Gaussians, from which the search guesses its next size. First number:
-/// decrease of the PSNR against the original, dB; used if a minimum PSNR is requested. Second number: factor by which
-/// the loss of PSNR against photographs grows; used if a maximum loss is requested.
+/// Approximate loss of quality when the number of Gaussians is halved, from which the search computes its next size.
+/// First number, used if a minimum PSNR is requested: decrease of the PSNR against the original, dB. Second number,
+/// used if a maximum loss is requested: factor by which the loss of PSNR against photographs grows.
 const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
-/// Surplus of quality (quality above the requested one) that is small enough to end the search. Unit: halvings of the
-/// number of Gaussians; with a surplus of 1, about half as many Gaussians would suffice.
+/// The search ends if the surplus of quality (quality above the requested one) is at most this value. Unit: halvings of
+/// the number of Gaussians; with a surplus of 1, about half as many Gaussians would suffice.
 const MAX_SURPLUS: f64 = 0.03;
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
@@ -79,9 +79,9 @@ pub struct SearchStage {
     refine: Option<RefineStage>,
     /// Whether every tried model is also fitted to photographs, those in the folder of [`Quality::Loss`].
     fits_photographs: bool,
-    /// Margins of PSNR, dB, that decide about two optional reductions of the model. First: storing the deformation
-    /// field in half precision ([`FieldPrecisionStage::margin`]); `None` if the field stays exact. Second: dropping SH
-    /// degrees ([`ShDegreeStage::margin`]); `None` if all degrees stay.
+    /// Margins of PSNR, dB, of two optional reductions of the model. First: storing the deformation field in half
+    /// precision ([`FieldPrecisionStage::margin`]); `None` if the field stays exact. Second: dropping SH degrees
+    /// ([`ShDegreeStage::margin`]); `None` if all degrees stay.
     margins: [Option<f64>; 2],
 }
 
@@ -121,8 +121,9 @@ impl SearchStage {
     }
 
     /// Returns the resource estimate (memory, time, reads) of the search. `repeated` holds the estimates of the stages
-    /// that run for every size. The memory is that of the largest of these stages, plus that of the models which the
-    /// search keeps. Time and reads are the sums over these stages, times the usual number of sizes.
+    /// that run for every size. The memory is that of the repeated stage with the largest memory, plus that of the
+    /// models which the search keeps. Time and reads are the sums over all repeated stages, times the usual number of
+    /// sizes.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
         let whole = work.state_bytes(Attributes::all());
@@ -149,8 +150,8 @@ impl SearchStage {
         // A rendered view, and the image that it is compared with: once as read, once as used.
         need.fixed.push(("compared", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
         need.fixed.push(("field", work.input.fixed));
-        // Prune steps remove a fifth of the Gaussians each, starting from two fifths of all: the states kept after them
-        // hold twice the number of Gaussians together.
+        // Each prune step removes a fifth of the Gaussians, starting from two fifths of all. So the models that are
+        // kept after prune steps have together twice as many Gaussians as the input.
         need.per_gaussian.extend([
             ("ways", 3 * (whole + 8)),
             ("result", work.input.reduced),
@@ -296,8 +297,8 @@ impl SearchStage {
         let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
         let mut best: Option<TriedSize> = None;
-        // Bounds of the search, each with its surplus of quality in halvings: size `low` fails, size `high` passes.
-        // `None`: not tried.
+        // Bounds of the search: size `low` fails, size `high` passes. Each has its surplus of quality in halvings, or
+        // `None` if the size was not tried.
         let (mut low, mut high) = ((least.saturating_sub(1), None), (all, None));
         let mut next = FIRST_FRACTION * all as f64;
         while tried.len() < MAX_SIZES && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE_RATIO * low.0 as f64 {
@@ -315,7 +316,7 @@ impl SearchStage {
             }
             next = match (low, high) {
                 ((low, Some(below)), (high, Some(above))) => {
-                    // Slightly above the size at which the line through both surpluses crosses zero.
+                    // Slightly above the size at which a line through both surpluses crosses zero.
                     let part = ((0.5 * MAX_SURPLUS - below) / (above - below)).clamp(0.1, 0.9);
                     low as f64 * (high as f64 / low as f64).powf(part)
                 }
@@ -356,8 +357,9 @@ impl SearchStage {
         }
     }
 
-    /// Estimates by how many halvings the number of Gaussians may still decrease. `value` is the quality of the present
-    /// model, dB: its PSNR or its loss of PSNR. The estimate follows from [`COST_OF_HALVING`]:
+    /// Returns the surplus of quality: the estimated number of times that the number of Gaussians may still be halved.
+    /// `value` is the quality of the present model, dB: its PSNR or its loss of PSNR. The surplus follows from
+    /// [`COST_OF_HALVING`]:
     /// - 0: the quality is exactly the required one.
     /// - 1: the quality is so high that half as many Gaussians would suffice.
     /// - Below 0: the quality is worse than required, so more Gaussians are needed.

@@ -27,8 +27,8 @@ use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
-/// Fraction of the Gaussians that the last pruning round leaves if the run searches for the smallest model with a
-/// requested quality and does not refine.
+/// In a run that searches for the smallest model with a requested quality and does not refine, the last pruning round
+/// leaves this fraction of the Gaussians.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
 
 /// Phase of a run to which a stage belongs.
@@ -64,16 +64,15 @@ pub trait Stage: Debug + Send + Sync {
     /// memory and time.
     fn estimates(&self, input: EstimateInput<'_>) -> Vec<ResourceEstimate>;
 
-    /// Returns the parameters that determine the duration of the stage, for display in the form "NAME: 3000 steps".
-    /// Empty if there are none.
+    /// Returns the parameters that determine the duration of the stage, as text for display, such as "NAME: 3000
+    /// steps". Empty if there are none.
     fn parameters(&self) -> String {
         String::new()
     }
 
-    /// Returns whether the stage may turn out to be unnecessary because the run removes only Gaussians that hardly
-    /// change renders. The lower bound of the estimated time of a run leaves out stages for which this method returns
-    /// true. `_hardly_seen`: fraction of the Gaussians that can be removed before the PSNR of renders falls below 60
-    /// dB.
+    /// Returns whether the stage may turn out to be unnecessary, because the run removes only Gaussians that hardly
+    /// change renders. The lower bound of the estimated time of a run does not count such stages. `_hardly_seen`:
+    /// fraction of the Gaussians that can be removed before the PSNR of renders falls below 60 dB.
     fn may_be_skipped(&self, _input: EstimateInput<'_>, _hardly_seen: f64) -> bool {
         false
     }
@@ -91,8 +90,8 @@ pub trait Stage: Debug + Send + Sync {
         Vec::new()
     }
 
-    /// Checks, before any work, that the stage can run on the scene: that the files which it needs exist, and that the
-    /// output format can store the scene.
+    /// Checks, before any work, that the stage can run on the scene: the files that it needs must exist, and the output
+    /// format must be able to store the scene.
     ///
     /// # Errors
     /// Fails if files are missing or too few, or if the output format cannot store the scene.
@@ -141,8 +140,8 @@ impl Measured {
 /// optimization steps).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CountPlan {
-    /// Minimum fraction of all Gaussians with which refinement begins. Its prune steps then remove Gaussians until the
-    /// target is reached. `None`: ranking alone removes Gaussians.
+    /// Minimum fraction of all Gaussians with which refinement begins; its prune steps then remove Gaussians until the
+    /// target is reached. `None`: only ranking removes Gaussians.
     pub refinement_starts_at: Option<f64>,
     /// Whether the run searches for the number of Gaussians in the output.
     pub searches: bool,
@@ -157,7 +156,7 @@ impl CountPlan {
 
     /// Returns the number of Gaussians that ranking leaves. `wanted`: number of Gaussians in the output. `all`: number
     /// of Gaussians in the input. A search for the smallest model with a requested quality tries several models but
-    /// ranks only once. If the run searches, returns the number that the smallest tried model needs, whatever `wanted`
+    /// ranks only once. In such a run the result is the number that the smallest tried model needs, whatever `wanted`
     /// is.
     pub fn count_after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =

@@ -73,8 +73,7 @@ pub struct ArchiveSummary {
     /// - name of the attribute or tensor;
     /// - log2 of its quantization step; in an archive of frames, log2 of twice its error bound;
     /// - mean squared error of renders if only this attribute or tensor is quantized, with this step;
-    /// - number of bits that it takes with this step; in an archive of frames, counted in some blocks of Gaussians
-    ///   only.
+    /// - number of bits that it takes with this step; in an archive of frames, this number in some blocks of Gaussians.
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 

@@ -27,8 +27,8 @@ use crate::source::{Ids, ReadPlan};
 const MAX_TIME_FRACTION: f64 = 0.04;
 /// Maximum duration of the calibration, seconds, if it keeps all threads busy.
 const MAX_SECONDS: f64 = 1.0;
-/// Number of frames that the calibration reads of each block of Gaussians. If the input decodes frames in groups of
-/// more than this number, the calibration reads one whole group.
+/// Number of frames that the calibration reads of each block of Gaussians. If the input decodes more frames than this
+/// together, the calibration reads all frames of such a group.
 const FRAMES_PER_BLOCK: u64 = 16;
 /// Number of views that each thread renders for each of three measurements: the time of computing contributions, of
 /// computing removal errors, and of rendering images.
@@ -109,10 +109,10 @@ impl Calibration {
         Ok(found)
     }
 
-    /// Renders views of one frame to measure the speed of three kinds of work, in this order: computing contributions,
-    /// computing removal errors, rendering images. `expected` holds the estimated core-seconds of each kind. Updates
-    /// `pace` (measured time divided by estimated time, for each kind) and `hardly_seen` (fraction of the Gaussians
-    /// whose removal hardly changes renders). The measured time is added to `spent`.
+    /// Renders views of one frame to measure the speed of three kinds of work: computing contributions, computing
+    /// removal errors, and rendering images. `expected` holds the estimated core-seconds of each kind, in this order.
+    /// Stores two results in `self`: `pace` (for each kind, measured time divided by estimated time) and `hardly_seen`
+    /// (fraction of the Gaussians whose removal hardly changes renders). Adds the measured time to `spent`.
     fn render_views(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut MeasuredTime) -> Result<()> {
         let schedule = &scene.schedule;
         let middle = schedule.iter().count() / 2;

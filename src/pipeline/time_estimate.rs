@@ -12,7 +12,7 @@ const ERROR_RANGE: [f64; 2] = [0.5, 1.6];
 /// Lowest and highest ratio of measured to estimated core-seconds of runs without a calibration.
 const ERROR_RANGE_UNCALIBRATED: [f64; 2] = [0.25, 4.0];
 /// Lowest and highest ratio of measured to estimated core-seconds of runs whose amount of work depends on intermediate
-/// results. An example is a search for a requested quality: it is not known in advance how often it refines a model.
+/// results. An example is a search for a requested quality: how many models it refines is not known in advance.
 const ERROR_RANGE_SEARCH: [f64; 2] = [0.15, 2.5];
 /// Minimum fraction of the processors that the stages of a run keep busy on average. It is below 1 because some work is
 /// not divided among threads.

@@ -1,11 +1,12 @@
 //! Stage `archive`: chooses the quantization steps of the values in an archive (compact file of the result).
 //!
-//! Errors of quantization add up. If one group of values (an attribute or a tensor) is quantized alone, the squared
-//! error of renders grows in proportion to the square of its quantization step, and each octave (doubling) of the step
-//! saves about one bit per value. For a given total error the archive has the fewest bits if the error of every group
-//! is proportional to the bits that one octave saves in this group (reverse water-filling; Cover & Thomas, "Elements of
-//! Information Theory", 10.3.3). The stage measures the bits of every group, and its error on renders. Then it makes
-//! all steps together as coarse as the quality of renders of the archive allows.
+//! Errors of quantization add up. If one group of values (an attribute or a tensor) is quantized alone, two things
+//! hold: the squared error of renders is proportional to the square of its quantization step, and each octave
+//! (doubling) of the step saves about one bit per value. For a given total error, the archive has the fewest bits if
+//! the error of every group is proportional to the bits that one octave saves in this group (reverse water-filling;
+//! Cover & Thomas, "Elements of Information Theory", 10.3.3). So the stage measures the bits of every group and its
+//! error on renders, and sets the steps by this rule. Then it makes all steps together as coarse as the quality of
+//! renders of the archive allows.
 
 use std::collections::BTreeMap;
 
@@ -40,13 +41,14 @@ const NAME: &str = "archive";
 /// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
 /// coarser step would round nearly all values to the same number.
 const MAX_STEP: f64 = 4.0;
-/// Lower bound of the standard deviation from which the quantization step of a column is computed, as a fraction of the
-/// largest magnitude in the column. A column holds values of the Gaussians that belong to no attribute, such as
-/// velocities. If all values of a column are equal, this bound gives a step about as fine as the precision of f32.
+/// Lower bound of the standard deviation from which the quantization step of a further column is computed, as a
+/// fraction of the largest magnitude in the column. A further column holds values of the Gaussians that belong to no
+/// attribute, such as velocities. If all its values are equal, this bound gives a step about as fine as the precision
+/// of f32.
 const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
-/// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
-/// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this
-/// value, quantization then costs 0.5 and 1.2 dB PSNR on two trained models.
+/// The size of an archive is estimated without rendering, with the initial quantization steps made coarser by this
+/// number of octaves (doublings). The estimate decides how many Gaussians a result of at most `--size` bytes keeps;
+/// with this value, quantization then costs 0.5 and 1.2 dB PSNR on two trained models.
 const ESTIMATE_OCTAVES: f64 = 3.3;
 
 /// Stage that quantizes and encodes the result as an archive.
@@ -106,8 +108,8 @@ impl ValueGroup {
         }
     }
 
-    /// Returns the number of initial quantization steps in one standard deviation of the values of this group. Initial
-    /// steps are used before the steps are adapted to the quality of renders. They are finer than most final ones.
+    /// Returns the number of initial quantization steps in one standard deviation of the values of this group. The
+    /// stage starts with these steps and then adapts them to the quality of renders; most final steps are coarser.
     fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
@@ -126,11 +128,11 @@ impl ArchiveStage {
         let whole = work.state_bytes(Attributes::all());
         let count = view_count(work.pixels);
         // About forty groups of values are quantized alone in every balancing round, and all together in each halving.
-        let looked = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
+        let renders = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
         ResourceEstimate {
             stage: NAME,
             reads: 1.0,
-            seconds: work.render_seconds(looked, 0.3 * work.gaussian_count(), RENDER_COST),
+            seconds: work.render_seconds(renders, 0.3 * work.gaussian_count(), RENDER_COST),
             per_gaussian: vec![
                 ("states", whole),
                 ("readers", work.input.reader),
@@ -277,9 +279,10 @@ struct Grids {
     deviations: Vec<f64>,
     /// Log2 of the quantization step of each group (attribute, column or tensor) in `groups`.
     octaves: Vec<f64>,
-    /// Offsets for each tensor, by name, which are added to the log2 of its quantization step. Unit: eighths of an
-    /// octave (doubling). A feature plane has one offset per channel; a matrix one per row, then one per column; any
-    /// other tensor one per element. Empty if all are 0. See [`TensorSteps::channels`].
+    /// For each tensor, by name: offsets that are added to the log2 of its quantization step, in eighths of an octave
+    /// (doubling). A feature plane has one offset per channel; a matrix has one per row, then one per column; any other
+    /// tensor has one per element. All offsets are 0 for a tensor without an entry or with an empty list. See
+    /// [`TensorSteps::channels`].
     offsets: BTreeMap<String, Vec<i8>>,
 }
 
@@ -315,8 +318,8 @@ impl Grids {
 
     /// Measures the squared error of renders and the bits that every group of values causes. Then sets the quantization
     /// steps so that the error of each group is proportional to the bits that one octave of its step saves, and the sum
-    /// of all errors is about `error`. Returns the measurements, one entry per group: its name, log2 of its step before
-    /// the change, its error, and its bits.
+    /// of all errors is about `error`. Returns one entry per group: its name, log2 of its step before the change, its
+    /// measured error, and its measured bits.
     fn balance(
         &mut self,
         scene: &Scene,

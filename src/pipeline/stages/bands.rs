@@ -27,8 +27,8 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "bands";
 
-/// Name of the work "lowering the SH degree" in the journal (record of the run for the user). Used in its list of
-/// omitted work, if the result keeps its full SH degree.
+/// Name of the work "lowering the SH degree" in the journal (record of the run for the user). If the result keeps its
+/// full SH degree, the list of omitted work contains this name.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
 /// Returns the SH degree of a result of `scene` if the user asks for at most `degree`:
@@ -54,8 +54,9 @@ pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> us
 /// Stage that lowers the SH degree of a result if renders hardly change.
 #[derive(Debug, Clone)]
 pub(crate) struct ShDegreeStage {
-    /// Minimum difference of two PSNRs, dB, with which a degree is dropped: the PSNR between renders with the lower
-    /// degree and with all degrees, minus the PSNR between the result and the original.
+    /// A degree is dropped if one PSNR exceeds another by at least this margin, dB. The first is the PSNR of renders
+    /// with the lower degree against renders with all degrees; the second is that of the result against the original.
+    /// The first suffices alone if it is at least 60 dB.
     pub margin: f64,
 }
 

@@ -1,11 +1,12 @@
 //! Choice of the error bounds of the values in an archive of frames. Such an archive is a container (`format/SPEC.md`).
 //!
-//! If one attribute alone has an error bound, the squared error of renders grows in proportion to the square of the
-//! bound, and each octave (doubling) of the bound saves one bit of every value that carries information. For a given
-//! total error the archive has the fewest bits if the error of each attribute is proportional to the bits that one
-//! octave saves in this attribute. (The same rule gives the quantization steps of an archive of a model.) Errors are
-//! measured on renders of values that are rounded to multiples of twice the bound. Bits are counted by encoding some
-//! blocks of Gaussians. Finally all bounds are widened by a common factor, as far as the quality of renders allows.
+//! If one attribute alone has an error bound, two things hold: the squared error of renders is proportional to the
+//! square of the bound, and each octave (doubling) of the bound saves one bit of every value that carries information.
+//! For a given total error, the archive has the fewest bits if the error of each attribute is proportional to the bits
+//! that one octave saves in this attribute. (The same rule gives the quantization steps of an archive of a model.)
+//! Errors are measured on renders of values that are rounded to multiples of twice the bound. Bits are counted by
+//! encoding some blocks of Gaussians. Finally all bounds are widened by a common factor, as far as the quality of
+//! renders allows.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -36,8 +37,8 @@ const INITIAL_BOUNDS: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
 const MAX_WIDENING: f64 = 64.0;
 /// Maximum number of blocks of Gaussians that are encoded to count the bits of every attribute.
 const COUNTED_BLOCKS: usize = 4;
-/// Octaves (doublings) by which the initial error bounds are widened to estimate the size of an archive without
-/// rendering.
+/// The size of an archive is estimated without rendering, with the initial error bounds widened by this number of
+/// octaves (doublings).
 const ESTIMATE_OCTAVES: f64 = 2.0;
 
 /// Returns the storage options of a container whose values may differ from the exact ones by at most `bounds`.

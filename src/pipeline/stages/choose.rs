@@ -25,8 +25,8 @@ use crate::scene::Scene;
 const NAME: &str = "choose";
 
 /// Number of views on which the merged and the pruned model are compared; they are chosen among the views used for
-/// scoring. The mean PSNR over these few views differs from the mean over all views by less than the two models usually
-/// differ from each other.
+/// scoring. The mean PSNR over these few views differs from the mean over all views, but by less than the PSNRs of the
+/// two models usually differ.
 const COMPARED_VIEWS: usize = 24;
 
 /// Number of views of one frame that are rendered at the same time.

@@ -32,8 +32,9 @@ pub(crate) const COMPARED_VIEWS: usize = 12;
 /// Stage that chooses the precision in which the deformation field of a result is written.
 #[derive(Debug, Clone)]
 pub(crate) struct FieldPrecisionStage {
-    /// Minimum difference of two PSNRs, dB, with which half precision is used: the PSNR between renders with the
-    /// half-precision field and with the exact field, minus the PSNR between the result and the original.
+    /// Half precision is used if one PSNR exceeds another by at least this margin, dB. The first is the PSNR of renders
+    /// with the half-precision field against renders with the exact field; the second is that of the result against the
+    /// original. The first suffices alone if it is at least 60 dB.
     pub margin: f64,
 }
 

@@ -56,9 +56,9 @@ const MIN_DIVIDED_PAIRS: usize = 20_000;
 /// its merge class (only Gaussians of the same class may merge).
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
-/// Assumed number of times that the stage merges, each time a different number of survivors (Gaussians left by
-/// pruning), until exactly the requested number of Gaussians is left; used to estimate reads. The secant search
-/// ([`bracket`]) usually needs fewer.
+/// Assumed number of trials of the secant search ([`bracket`]), each of which merges a different number of survivors
+/// (Gaussians left by pruning), until exactly the requested number of Gaussians is left. Used to estimate reads;
+/// usually fewer trials are needed.
 const USUAL_TRIALS: f64 = 16.0;
 
 /// Number of Gaussians whose states with all attributes are read at a time, at the reference frame (at which Gaussians
@@ -236,13 +236,12 @@ impl MergeStage {
 /// - `all`: number of all survivors.
 /// - `merged`: merges the given number of survivors with all possible joins, and returns the number of Gaussians left.
 ///
-/// Returns about the largest number m, from `target` to `all`, for which at most `target` Gaussians are left. Such an m
-/// exists: for m = `target` the condition holds. The caller merges m survivors again and stops after m − `target`
-/// joins. Then exactly `target` Gaussians are left.
+/// Returns a number m, from `target` to `all`, for which at most `target` Gaussians are left; it is about the largest.
+/// Such an m exists, because `target` survivors leave at most `target` Gaussians. The caller merges m survivors again
+/// and stops after m − `target` joins. Then exactly `target` Gaussians are left.
 ///
 /// The search narrows the interval of possible m by the secant method. This works because more survivors leave more
-/// Gaussians after merging, except for small dips. It ends early if the number of Gaussians left is at most a
-/// thousandth of `target` below `target`.
+/// Gaussians after merging, except for small dips. It ends early if at most `target`/1000 Gaussians too few are left.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;
@@ -268,8 +267,9 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
 /// Input of merging, kept in memory so that merging can be tried on many sets of survivors (Gaussians left by pruning).
 struct Trial<'a> {
     scored: &'a Scored,
-    /// Merge parameters of the recipe. `motion_noise` (noise of a step from frame to frame, when motions are compared)
-    /// is raised to at least twice the distance between neighboring f32 values at the scene's largest coordinate.
+    /// Merge parameters of the recipe, with a larger `motion_noise` if necessary: at least twice the distance between
+    /// neighboring f32 values at the scene's largest coordinate. (`motion_noise` is the noise of a step from frame to
+    /// frame, when motions are compared.)
     merge: recipe::MergeParams,
     /// Ids, in increasing order, of the Gaussians whose states are in memory. These Gaussians are called the pool.
     pool: Vec<u32>,
@@ -373,7 +373,7 @@ impl<'a> Trial<'a> {
     }
 }
 
-/// Measures the similarity of motion of the two Gaussians of each pair in `pairs`. Returns the pairs with their
+/// Measures the motion similarity of the two Gaussians of each pair in `pairs`, and returns the pairs with their
 /// similarities, in no particular order. The pairs hold indices in `pool`, the ids of the Gaussians in memory;
 /// `reference` holds the positions of these Gaussians at the reference frame. If the cache is enabled and there are at
 /// least [`MIN_DIVIDED_PAIRS`] pairs, sorts them by position in space and divides them into shards, which several

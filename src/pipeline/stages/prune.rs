@@ -38,7 +38,7 @@ impl Stage for Prune {
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
         let most = ranking.order().len();
-        // With a byte limit, more Gaussians may fit than may stay.
+        // With a byte limit, the number of Gaussians that fit may exceed the number of Gaussians that may stay.
         let target = run.target.map(|target| if run.request.goal.is_some() { target.min(most) } else { target });
         run.refine_to = self.survivors(run.scene, &scored, &ranking, target, &mut run.journal)?;
         let survivors = run.stages.counts.count_before_refinement(run.refine_to, scored.gaussian_count()).min(most);

@@ -38,15 +38,15 @@ const FEWEST_VIEWS: usize = 4;
 /// Fraction of the run's estimated processor time that measuring quality may take. The goal is 3% of the measured time.
 /// The fraction is lower because the estimates of other stages were up to 1.6 times too high.
 const MAX_TIME_FRACTION: f64 = 0.014;
-/// Assumed maximum number of times that the stage reads the frames of the measured views, for the estimate of its
-/// reads: for the original, for the result (whose frames are computed from the same input) and for the timed views.
+/// Assumed maximum number of times that the stage reads the frames of the measured views: for the original, for the
+/// result (whose frames are computed from the same input), and for the timed views. Used to estimate its reads.
 const READS: f64 = 2.5;
 /// Assumed maximum number of times that the stage reads the frames of the measured views if the result has proxies
 /// (Gaussians that replace merged clusters). It is higher than [`READS`], the number without proxies, because the
 /// members of a cluster lie in several blocks of the input.
 const MERGED_READS: f64 = 6.0;
-/// Bytes that must remain free within the memory limit, beyond the estimate: this optional stage runs only if memory is
-/// plentiful.
+/// This optional stage runs only if memory is plentiful: at least this number of bytes must remain free within the
+/// memory limit, beyond the estimate.
 const MARGIN: u64 = 8 << 20;
 /// Number of views whose rendering is timed, on one thread.
 const TIMED_VIEWS: usize = 3;

@@ -25,9 +25,9 @@ const DEFAULT_LOSS: f64 = 0.5;
 /// noise. The archive then has to reach this PSNR against the result before quantization.
 const ENOUGH_PSNR: f64 = 50.0;
 /// Loss of PSNR, dB, that a run allows for the quantization of an archive. A search for a requested PSNR therefore
-/// looks for a model that exceeds the request by this amount. Quantization may then add a third of the squared error of
-/// pruning: 10·log10(1 + 1/3) ≈ 1.2. A third is the best trade-off: raising the error of pruning by some percentage
-/// saves about three times as many bytes as raising the error of quantization by the same percentage.
+/// looks for a model that exceeds the request by this amount. With this value, quantization may add a third of the
+/// squared error of pruning: 10·log10(1 + 1/3) ≈ 1.2. A third is the best trade-off: raising the error of pruning by
+/// some percentage saves about three times as many bytes as raising the error of quantization by the same percentage.
 pub(crate) const ARCHIVE_HEADROOM: f64 = 1.2;
 /// Maximum amount, dB, by which an archive may miss its required PSNR against the result before quantization. If it
 /// misses more, the run fails.
@@ -42,15 +42,15 @@ const MAX_STEP_CHANGE: f64 = 2.5;
 /// Smallest mean squared error of renders that is distinguished from 0.
 const MIN_ERROR: f64 = 1e-14;
 /// Range of the search for the coarsest quantization steps (or error bounds) with which an archive has the required
-/// PSNR. The search follows the balancing rounds ([`BALANCING_ROUNDS`]) and multiplies all steps by one common factor.
-/// First value: log2 of the factor for the finest steps; second value: for the coarsest steps.
+/// PSNR. After the balancing rounds ([`BALANCING_ROUNDS`]), the search multiplies all steps by one common factor. First
+/// value: log2 of the smallest factor (finest steps); second value: log2 of the largest factor (coarsest steps).
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
 /// Number of bisection steps of the search in [`OCTAVE_RANGE`] for the coarsest quantization steps with which an
 /// archive has the required PSNR.
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
-/// Range of the search for the finest quantization steps (or error bounds) with which an archive fits a byte limit. The
-/// search follows the balancing rounds ([`BALANCING_ROUNDS`]) and multiplies all steps by one common factor. First
-/// value: log2 of the factor for the coarsest steps; second value: for the finest steps.
+/// Range of the search for the finest quantization steps (or error bounds) with which an archive fits a byte limit.
+/// After the balancing rounds ([`BALANCING_ROUNDS`]), the search multiplies all steps by one common factor. First
+/// value: log2 of the largest factor (coarsest steps); second value: log2 of the smallest factor (finest steps).
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
 /// Number of bisection steps of the search in [`BYTES_OCTAVE_RANGE`] for the finest quantization steps with which an
 /// archive fits its byte limit. Each bisection step encodes an archive and halves the range.
@@ -211,7 +211,7 @@ pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -
 }
 
 /// Searches the numbers from `low` to `high` for the one nearest to `high` at which `evaluate` returns a result (not
-/// `None`). Makes `halvings` bisection steps. Assumes that `evaluate` returns results from `low` up to some number, and
+/// `None`), by `halvings` bisection steps. Assumes that `evaluate` returns results from `low` up to some number, and
 /// none beyond it. `low` may be larger than `high`. Returns the result at the best tried number, or `None` if no tried
 /// number has a result.
 pub(crate) fn bisect<T>(
@@ -231,7 +231,7 @@ pub(crate) fn bisect<T>(
 }
 
 /// Returns the number of octaves (doublings) by which a quantization step must grow so that it causes about the squared
-/// error `error` instead of `found`, the measured one. The result is limited to [`MAX_STEP_CHANGE`] in both directions.
+/// error `error`. `found` is the error that the present step causes. The result is limited to ±[`MAX_STEP_CHANGE`].
 pub(crate) fn step_change(error: f64, found: f64) -> f64 {
     (0.5 * (error / found.max(MIN_ERROR)).log2()).clamp(-MAX_STEP_CHANGE, MAX_STEP_CHANGE)
 }

@@ -41,11 +41,11 @@ pub(crate) struct Rounds {
     /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
     pub views: usize,
     /// Number of groups into which the views are divided. The first round renders the views of all groups. Every later
-    /// round renders one group, and uses the errors that earlier rounds measured for the others.
+    /// round renders only one group; for all other groups it uses the errors that earlier rounds measured.
     pub groups: usize,
-    /// Color difference (norm over red, green and blue, each from 0 to 1) whose square is added to the squared color
-    /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
-    /// color of its background.
+    /// Constant c of the removal errors: c² is added to each squared difference between the color of a Gaussian and the
+    /// color behind it (norm over red, green and blue, each from 0 to 1). Otherwise a Gaussian with the color of its
+    /// background would have a removal error of 0.
     pub contrast_floor: f64,
     /// Smallest fraction of the Gaussians of the input that the last pruning round may leave, as assumed in estimates.
     /// It bounds the number of pruning rounds.
@@ -314,8 +314,8 @@ fn entry_name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 
-/// Returns which groups of views are rendered in a round, as indices into `groups`: all groups in the first round (0),
-/// then one group per round in turn.
+/// Returns the groups of views that are rendered in a round, as indices into `groups`: all groups in the first round
+/// (number 0), then one group per round in turn.
 fn active_groups(groups: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = usize> {
     let count = groups.len().max(1);
     let active = if round == 0 { groups.len() } else { 1.min(groups.len()) };

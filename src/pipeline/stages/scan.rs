@@ -22,8 +22,8 @@ const SECONDS_TO_ACCUMULATE: f64 = 2e-8;
 /// Processor time of projecting one Gaussian at one frame to a view, seconds (`benches/projection.rs`).
 const SECONDS_TO_PROJECT: f64 = 8e-9;
 
-/// Maximum number of frames that a partial scan (of some frames only) reads. It measures the bounds of positions and
-/// the fraction of views in which a Gaussian is on screen; neither decides which Gaussians stay.
+/// Maximum number of frames that a partial scan reads. Such a scan measures only the bounds of positions and the
+/// fraction of views in which a Gaussian is on screen; neither decides which Gaussians stay.
 const PARTIAL_FRAMES: usize = 24;
 
 /// Stage that gathers the statistics of all Gaussians.
@@ -32,7 +32,7 @@ pub struct ScanStage {
     /// Parameters of the statistics that are gathered.
     pub recipe: recipe::ScanParams,
     /// Whether the scan may read only some of the frames, because the statistics of motion and opacity (D, κ and V)
-    /// decide nothing in this run. Frames are skipped only if a deformation field computes them, because its values
+    /// decide nothing in this run. Even then, frames are skipped only if a deformation field computes them: its values
     /// change smoothly with time.
     pub can_be_partial: bool,
 }

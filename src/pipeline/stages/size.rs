@@ -53,8 +53,8 @@ pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
 #[derive(Debug)]
 struct CountByBytes {
     limit: ByteLimit,
-    /// Whether lower SH degrees are tried as well: the number of Gaussians that fit the byte limit is then found for
-    /// each of them.
+    /// Whether lower SH degrees are tried as well. The number of Gaussians that fit the byte limit is then found for
+    /// each degree.
     drops_bands: bool,
 }
 
@@ -264,8 +264,9 @@ impl ByteLimit {
 /// of bytes that the Gaussians may take, divided by the number that they take. `protected`: number of Gaussians that
 /// must stay, less than `count`. `tried`: number of sizes tried before.
 ///
-/// The result is at least `protected` and less than `count`. After [`MAX_TRIED`] sizes, it is at most half of `count`
-/// (or `protected`). So the search ends after at most 32 more sizes, however bytes depend on the number of Gaussians.
+/// The result is at least `protected` and less than `count`. Once [`MAX_TRIED`] sizes have been tried, it is at most
+/// half of `count` (or `protected`). So the search ends after at most 32 more sizes, no matter how the bytes depend on
+/// the number of Gaussians.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
     let most = if tried < MAX_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)

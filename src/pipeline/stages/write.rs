@@ -41,8 +41,8 @@ const USUAL_LEFT: f64 = 0.5;
 /// Processor time of encoding and writing one Gaussian at one frame, seconds (`benches/pack.rs`).
 pub const ENCODE_SECONDS_PER_STATE: f64 = 3.5e-7;
 
-/// Assumed maximum number of bytes of the summary file and the header of the index map together. Long lists of files or
-/// notes may exceed it.
+/// Assumed maximum total number of bytes of two things: the summary file, and the header of the index map. Long lists
+/// of files or notes may exceed it.
 const MAX_SUMMARY_BYTES: u64 = 16 << 10;
 
 /// Name of the file, beside every result, that holds all parameters of its run.
@@ -151,8 +151,8 @@ impl Stage for WriteStage {
     }
 }
 
-/// Adapts `map`, which holds for every input Gaussian its index in the result, to an output file with another order of
-/// Gaussians. The Gaussian with index `i` in the file has the index `order[i]` in the result.
+/// Adapts the index map `map` (for every input Gaussian its index in the result) to an output file in which the
+/// Gaussians have another order. The Gaussian with index `i` in the file has the index `order[i]` in the result.
 fn reorder(map: &mut [Option<u32>], order: &[u32]) {
     let mut places = vec![0; order.len()];
     order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
