@@ -29,7 +29,7 @@ const MAX_SCENE_VIEWS: usize = 60;
 const PHOTOGRAPH_PART: [usize; 2] = [20, 26];
 /// Maximum number of target views that are photographs.
 const MAX_PHOTOGRAPHS: usize = 400;
-/// In a refinement toward photographs, [a, b] means: for every b photographs, a renders of the original from new
+/// In a refinement toward photographs, `[a, b]` means: for every b photographs, a renders of the original from new
 /// cameras are added as target views. They keep the result from overfitting the photographs.
 const RENDERS_PER_PHOTOGRAPH: [usize; 2] = [3, 10];
 /// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
