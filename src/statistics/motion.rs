@@ -155,8 +155,9 @@ impl MotionSums {
     }
 
     /// Counts the frames in `steady`, in which no opacity has changed. Each Gaussian that is alive (opacity ≥
-    /// alpha_min) in them gets their number of steps and turns. The others have not been alive in any frame yet, so
-    /// their sums over steps and turns are set to 0. Must be called before results are read.
+    /// alpha_min) in them gets one more step per frame, and one more turn per frame but the first. The other Gaussians
+    /// have not been alive in any frame yet, so their sums over steps and turns are set to 0. Must be called before
+    /// results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
