@@ -32,7 +32,7 @@ const CACHE: &str = "Resuming and sharing a run";
 /// Makes trained dynamic (4D) Gaussian-splatting models much smaller. Needs no GPU and no training code; your renderer
 /// opens the result
 #[derive(Debug, Parser)]
-#[command(name = "splatsieve", version, about, max_term_width = 110)]
+#[command(name = "splatsieve", version, max_term_width = 110)]
 pub(super) struct Cli {
     /// Command to run.
     #[command(subcommand)]

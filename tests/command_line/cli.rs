@@ -52,7 +52,7 @@ fn replace(bytes: &mut [u8], from: &[u8], to: &[u8]) {
 fn help_describes_the_tool_and_shows_examples() {
     let workplace = Workplace::new();
     let help = workplace.done("--help");
-    assert!(help.starts_with("Shrinks trained dynamic Gaussian-splatting models"), "{help}");
+    assert!(help.starts_with("Makes trained dynamic (4D) Gaussian-splatting models much smaller"), "{help}");
     assert!(help.contains("\n\nExamples:\n  splatsieve demo"), "{help}");
     for verb in crate::docs::COMMANDS {
         assert!(help.contains(verb), "{verb} is not in the help");
