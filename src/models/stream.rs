@@ -33,8 +33,8 @@ use crate::source::FrameSource;
 const HELD_BYTES: u64 = 64 << 20;
 /// Maximum number of frames that the reading thread has read ahead and that are not yet packed.
 pub const PREFETCH_FRAMES: usize = 2;
-/// Compression of the temporary container. It is the same as in the command `pack`, so that a stream and the container
-/// into which `pack` writes it have the same digest (hash of the input).
+/// Compression of the temporary container. It is the same as in the command `convert`, so that a stream and the
+/// container into which `convert` writes it have the same digest (hash of the input).
 const COMPRESSION: Compression = Compression::Zstd(1);
 
 /// Frame stream that was received completely.
