@@ -28,7 +28,7 @@ use gseq::Compression;
 use splatsieve::diagnostics::demo_scene;
 use splatsieve::files::container::Container;
 use splatsieve::merging;
-use splatsieve::merging::motion::{MotionThresholds, PairMotion};
+use splatsieve::merging::motion::{MotionThresholds, PairMotionAccumulator};
 use splatsieve::merging::motion_pass::PairMeter;
 use splatsieve::merging::neighbors::PointIndex;
 use splatsieve::merging::proxy::Importance;
@@ -230,7 +230,7 @@ fn motion(criterion: &mut Criterion) {
         bencher.iter(|| {
             one_thread.install(|| {
                 let reference = (0..position.len()).map(|i| position.row(i));
-                let mut motion = PairMotion::new(pairs.iter().copied(), reference, MotionParams::Runs);
+                let mut motion = PairMotionAccumulator::new(pairs.iter().copied(), reference, MotionParams::Runs);
                 for frame in 0..frames {
                     motion.add_frame(|i| (position.row::<3>(i).map(|x| x + 0.01 * frame as f32), true));
                 }

@@ -75,7 +75,7 @@ impl BlockReader for CurveReader {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
             let time = if self.varying.contains(column) { frame } else { 0 };
-            let to = out.column_mut(column);
+            let to = out.attribute_values_mut(column);
             to.resize(self.ids.len());
             for c in 0..to.width() {
                 for (x, id) in to.plane_mut(c).iter_mut().zip(&self.ids) {
@@ -228,7 +228,7 @@ impl FrameSource for BenchSource<'_> {
         }
     }
 
-    fn ahead(&self) -> Option<&dyn Prefetch> {
+    fn prefetcher(&self) -> Option<&dyn Prefetch> {
         self.in_stages.then_some(self)
     }
 }

@@ -57,7 +57,7 @@ pub struct ParamDelta(pub Gaussians);
 impl ParamDelta {
     /// Returns the attributes for which this delta has values.
     pub fn attributes(&self) -> Attributes {
-        let changes = |&column: &Attributes| !self.0.column(column).is_empty();
+        let changes = |&column: &Attributes| !self.0.attribute_values(column).is_empty();
         Attributes::all().iter().filter(changes).collect()
     }
 
@@ -70,21 +70,24 @@ impl ParamDelta {
     pub fn pick(&self, places: &[u32]) -> ParamDelta {
         let mut picked = ParamDelta::default();
         for column in self.attributes().iter() {
-            *picked.0.column_mut(column) = self.0.column(column).pick(places);
+            *picked.0.attribute_values_mut(column) = self.0.attribute_values(column).pick(places);
         }
         picked
     }
 
     /// Multiplies every value of this delta by `by`.
     pub fn scale(&mut self, by: f32) {
-        self.0.columns_mut(Attributes::all()).flat_map(AttributeValues::planes_mut).for_each(|x| *x *= by);
+        self.0
+            .selected_attribute_values_mut(Attributes::all())
+            .flat_map(AttributeValues::planes_mut)
+            .for_each(|x| *x *= by);
     }
 
     /// Returns the sum of this delta and `more`. If both have SH coefficients, the SH degree of `more` must be at least
     /// that of this delta.
     pub fn plus(self, mut more: ParamDelta) -> ParamDelta {
         for column in self.attributes().iter() {
-            let (from, to) = (self.0.column(column), more.0.column_mut(column));
+            let (from, to) = (self.0.attribute_values(column), more.0.attribute_values_mut(column));
             if to.is_empty() {
                 *to = from.clone();
             } else {
@@ -105,7 +108,7 @@ impl ParamDelta {
     /// row i of `state`. Adding 0 leaves the bits of a value unchanged.
     pub fn add_to(&self, state: &mut Gaussians, attributes: Attributes) {
         for column in (self.attributes() & attributes).iter() {
-            let (by, values) = (self.0.column(column), state.column_mut(column));
+            let (by, values) = (self.0.attribute_values(column), state.attribute_values_mut(column));
             for c in 0..by.width().min(values.width()) {
                 for (value, &by) in values.plane_mut(c).iter_mut().zip(by.plane(c)) {
                     *value = if by == 0.0 { *value } else { *value + by };
@@ -342,38 +345,38 @@ mod tests {
         );
         let mut of_all = Gaussians::zeros(2, 1);
         of_all.sh.planes_mut().fill(0.5);
-        let mut reduction = CompressedModel::pruned(vec![2, 7], &Recipe::preset("default").unwrap().merge);
-        (reduction.delta, reduction.trajectory_delta) = (ParamDelta(of_all), course);
-        let both = reduction.delta_at(4, 9);
+        let mut compressed = CompressedModel::pruned(vec![2, 7], &Recipe::preset("default").unwrap().merge);
+        (compressed.delta, compressed.trajectory_delta) = (ParamDelta(of_all), course);
+        let both = compressed.delta_at(4, 9);
         assert_eq!((both.0.position.row(0), both.0.sh.row::<12>(1)), ([3.0, 6.0, 0.0], [0.5; 12]));
-        assert_eq!(reduction.pick(&[1]).delta_at(4, 9), both.pick(&[1]));
+        assert_eq!(compressed.pick(&[1]).delta_at(4, 9), both.pick(&[1]));
     }
 
     #[test]
     fn refused_clusters_keep_only_their_leaders() {
         let rule = Recipe::preset("default").unwrap().merge;
-        let mut reduction = CompressedModel::pruned(vec![1, 4, 6], &rule);
+        let mut compressed = CompressedModel::pruned(vec![1, 4, 6], &rule);
         let cluster = |output: u32, leader: u32, other: u32| Cluster {
             output,
             leader,
             members: vec![(leader, 0.5), (other, 0.5)],
         };
-        reduction.clusters = vec![cluster(0, 1, 2), cluster(1, 4, 5), cluster(2, 6, 7)];
+        compressed.clusters = vec![cluster(0, 1, 2), cluster(1, 4, 5), cluster(2, 6, 7)];
         let mut raw = StoredParams::from(Gaussians::zeros(3, 0));
         (0..3).for_each(|row| raw.gaussians.position.set_row(row, [row as f32; 3]));
-        reduction.set_proxies(Proxies { raw: Some(raw), refused: vec![1], ..Proxies::default() });
-        assert_eq!(reduction.index_map(8), [None, Some(0), Some(0), None, Some(1), None, Some(2), Some(2)]);
-        assert_eq!(reduction.proxies.raw.unwrap().gaussians.position.plane(0), [0.0, 2.0]);
-        assert!(reduction.proxies.refused.is_empty());
+        compressed.set_proxies(Proxies { raw: Some(raw), refused: vec![1], ..Proxies::default() });
+        assert_eq!(compressed.index_map(8), [None, Some(0), Some(0), None, Some(1), None, Some(2), Some(2)]);
+        assert_eq!(compressed.proxies.raw.unwrap().gaussians.position.plane(0), [0.0, 2.0]);
+        assert!(compressed.proxies.refused.is_empty());
     }
 
     #[test]
     fn members_of_a_cluster_share_its_index() {
         let rule = Recipe::preset("default").unwrap().merge;
-        let mut reduction = CompressedModel::pruned(vec![1, 4], &rule);
-        assert_eq!(reduction.index_map(6), [None, Some(0), None, None, Some(1), None]);
-        reduction.clusters.push(Cluster { output: 1, leader: 4, members: vec![(2, 0.25), (4, 0.75)] });
-        assert_eq!(reduction.index_map(6), [None, Some(0), Some(1), None, Some(1), None]);
-        assert_eq!((reduction.len(), reduction.is_empty()), (2, false));
+        let mut compressed = CompressedModel::pruned(vec![1, 4], &rule);
+        assert_eq!(compressed.index_map(6), [None, Some(0), None, None, Some(1), None]);
+        compressed.clusters.push(Cluster { output: 1, leader: 4, members: vec![(2, 0.25), (4, 0.75)] });
+        assert_eq!(compressed.index_map(6), [None, Some(0), Some(1), None, Some(1), None]);
+        assert_eq!((compressed.len(), compressed.is_empty()), (2, false));
     }
 }

@@ -103,7 +103,7 @@ impl ReadPlan {
 
 /// Amounts read from a source, counted by the code that reads.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Reads {
+pub struct ReadCounts {
     /// Number of bytes of attribute values read from files, as stored there.
     pub bytes: u64,
     /// Number of tiles decoded, a tile being some Gaussians at consecutive frames; 0 for sources without tiles.
@@ -112,21 +112,25 @@ pub struct Reads {
     pub states: u64,
 }
 
-impl Add for Reads {
-    type Output = Reads;
+impl Add for ReadCounts {
+    type Output = ReadCounts;
 
-    fn add(self, other: Reads) -> Reads {
-        Reads { bytes: self.bytes + other.bytes, tiles: self.tiles + other.tiles, states: self.states + other.states }
+    fn add(self, other: ReadCounts) -> ReadCounts {
+        ReadCounts {
+            bytes: self.bytes + other.bytes,
+            tiles: self.tiles + other.tiles,
+            states: self.states + other.states,
+        }
     }
 }
 
-impl Sub for Reads {
-    type Output = Reads;
+impl Sub for ReadCounts {
+    type Output = ReadCounts;
 
     /// Returns the amounts read between two counts of the same source. `self` is the later count, `before` the earlier
     /// one.
-    fn sub(self, before: Reads) -> Reads {
-        Reads {
+    fn sub(self, before: ReadCounts) -> ReadCounts {
+        ReadCounts {
             bytes: self.bytes - before.bytes,
             tiles: self.tiles - before.tiles,
             states: self.states - before.states,
@@ -187,13 +191,13 @@ pub trait FrameSource: Send + Sync {
     }
 
     /// Returns the amounts read so far by all readers of this source; zeros if the source does not count.
-    fn reads(&self) -> Reads {
-        Reads::default()
+    fn reads(&self) -> ReadCounts {
+        ReadCounts::default()
     }
 
     /// Returns the object that can fetch bytes from the disk before a reader needs them. Returns `None` if this saves
     /// no time.
-    fn ahead(&self) -> Option<&dyn Prefetch> {
+    fn prefetcher(&self) -> Option<&dyn Prefetch> {
         None
     }
 }

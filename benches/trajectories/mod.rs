@@ -56,7 +56,7 @@ fn curves() -> FramesInMemory {
     for frame in 0..FRAMES {
         let mut state = Gaussians::zeros(GAUSSIANS, 0);
         for (c, column) in varying.iter().enumerate() {
-            for (k, x) in state.column_mut(column).planes_mut().iter_mut().enumerate() {
+            for (k, x) in state.attribute_values_mut(column).planes_mut().iter_mut().enumerate() {
                 let k = c << 20 | k;
                 *x = (6.0 * random(k) + 0.05 * frame as f32).sin() + 1e-4 * random(k | (frame + 1) << 32);
             }
@@ -76,7 +76,7 @@ pub(crate) fn tiles(scene: &FramesInMemory, column: Attributes) -> Vec<Vec<f32>>
         let mut values = Vec::new();
         for frame in 0..scene.len() {
             reader.read(frame, column, &mut state).unwrap();
-            values.extend_from_slice(state.column(column).planes());
+            values.extend_from_slice(state.attribute_values(column).planes());
         }
         values
     };

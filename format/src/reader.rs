@@ -254,7 +254,7 @@ impl Reader {
     ///
     /// # Panics
     /// Panics if there is no such column.
-    pub fn varies(&self, column: u32) -> bool {
+    pub fn is_varying(&self, column: u32) -> bool {
         self.varies[column as usize]
     }
 

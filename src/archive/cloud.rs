@@ -14,7 +14,7 @@ use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
 use super::residual::Residuals;
 use super::step::QuantizationGrid;
-use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
+use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficient_count};
 
 /// Names of the attributes that each have their own quantization step, in the order of [`CloudSteps`]; SH coefficients
 /// have one step per SH degree.
@@ -101,7 +101,7 @@ fn attribute_planes(sh_degree: usize) -> Vec<Plane> {
     let mut planes: Vec<_> = (0..4).map(|c| plane(Attributes::ROTATION, c, 1)).collect();
     planes.extend((0..3).map(|c| plane(Attributes::LOG_SCALE, c, 2)));
     planes.push(plane(Attributes::OPACITY, 0, 3));
-    planes.extend((0..3 * sh_coefficients(sh_degree)).map(|c| plane(Attributes::SH, c, 4 + (c / 3).isqrt())));
+    planes.extend((0..3 * sh_coefficient_count(sh_degree)).map(|c| plane(Attributes::SH, c, 4 + (c / 3).isqrt())));
     planes
 }
 
@@ -249,7 +249,7 @@ pub(super) fn encode(
         let (grid, group) = (shape.grid(coded), coded.group);
         let plane = match coded.source {
             PlaneSource::Attribute(Attributes::ROTATION, c) => rotation.plane(c),
-            PlaneSource::Attribute(attribute, c) => cloud.column(attribute).plane(c),
+            PlaneSource::Attribute(attribute, c) => cloud.attribute_values(attribute).plane(c),
             PlaneSource::Column(k, c) => columns[k].values.plane(c),
         };
         let multiples: Vec<i64> = order.iter().map(|&id| grid.multiple(plane[id as usize])).collect();
@@ -303,7 +303,7 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
         let (grid, mean) = (shape.grid(coded), shape.means[k]);
         let factors = factors(&shape.weights[k]);
         let plane = match coded.source {
-            PlaneSource::Attribute(attribute, c) => cloud.column_mut(attribute).plane_mut(c),
+            PlaneSource::Attribute(attribute, c) => cloud.attribute_values_mut(attribute).plane_mut(c),
             PlaneSource::Column(column, c) => columns[column].values.plane_mut(c),
         };
         coder.code_plane(coded.group, grid, mean, |i, around, size, models| {
@@ -443,7 +443,7 @@ pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usi
     }
     for (column, c, attribute) in components(cloud.sh_degree()) {
         if attributes.contains(&attribute) {
-            round_all(cloud.column_mut(column).plane_mut(c), steps[attribute]);
+            round_all(cloud.attribute_values_mut(column).plane_mut(c), steps[attribute]);
         }
     }
 }
@@ -458,5 +458,5 @@ pub(super) fn round_all(values: &mut [f32], step: i32) {
 /// the second scalar component of all Gaussians, and so on.
 pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
     let own = components(cloud.sh_degree()).filter(move |plane| plane.2 == attribute);
-    own.flat_map(|(column, c, _)| cloud.column(column).plane(c).iter().copied())
+    own.flat_map(|(column, c, _)| cloud.attribute_values(column).plane(c).iter().copied())
 }

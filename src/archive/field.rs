@@ -91,7 +91,7 @@ pub struct TensorSteps {
 /// Points in space and time at which the deformation field is evaluated. They determine which texels of its feature
 /// planes are read.
 #[derive(Debug)]
-pub(super) struct Readers<'a> {
+pub(super) struct EvaluationPoints<'a> {
     /// Canonical positions of the Gaussians.
     pub(super) position: &'a AttributeValues,
     /// Box of space that the feature planes cover; `None` if the field has no feature planes.
@@ -211,23 +211,27 @@ impl TensorEntry {
     /// it to `with`, and returns the result of `with`. Returns `None` without calling `with` if no value of the tensor
     /// is quantized.
     ///
-    /// `readers` holds the positions and times at which the deformation field is evaluated. They matter only for
+    /// `points` holds the positions and times at which the deformation field is evaluated. They matter only for
     /// feature planes, whose texels (grid elements) are interpolated at these positions and times:
     /// - The positions determine the quantization grid of each texel.
     /// - The times determine which rows of a time plane are stored.
-    fn with_quantized<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
+    fn with_quantized<R>(
+        &self,
+        points: &EvaluationPoints<'_>,
+        with: impl FnOnce(&QuantizedTensor<'_>) -> R,
+    ) -> Option<R> {
         if self.values() == Some(0) {
             return None;
         }
         let [channels, rows, columns] = self.extents();
-        let (classes, stored) = match (self.role, readers.space) {
+        let (classes, stored) = match (self.role, points.space) {
             (TensorRole::Plane(axes), Some(space)) => {
-                (texels::plane_classes(readers.position, &space, axes, [columns, rows]), 0..rows)
+                (texels::plane_classes(points.position, &space, axes, [columns, rows]), 0..rows)
             }
             (TensorRole::TimePlane(axis), Some(space)) => {
-                let [first, last] = readers.times;
+                let [first, last] = points.times;
                 (
-                    texels::time_plane_classes(readers.position, &space, axis, columns),
+                    texels::time_plane_classes(points.position, &space, axis, columns),
                     texels::time_rows(first, last, rows),
                 )
             }
@@ -268,14 +272,14 @@ impl SharedModels {
     }
 }
 
-/// Encodes the tensors of `entries`, whose values are in `tensors`. `readers` holds the positions and times at which
+/// Encodes the tensors of `entries`, whose values are in `tensors`. `points` holds the positions and times at which
 /// the deformation field is evaluated. Returns the entropy-coded symbols of the quantized tensors, and the values of
 /// tensors with [`TensorRole::Exact`]. Sets the means and predictor weights in the entries. Adds the approximate number
 /// of bits of every quantized tensor to `bits`, by name.
 pub(super) fn encode(
     entries: &mut [TensorEntry],
     tensors: &Tensors,
-    readers: &Readers<'_>,
+    points: &EvaluationPoints<'_>,
     bits: &mut BTreeMap<String, f64>,
 ) -> (Vec<u8>, Vec<f32>) {
     let (mut encoder, mut exact) = (SymbolEncoder::default(), Vec::new());
@@ -286,13 +290,13 @@ pub(super) fn encode(
             exact.extend(&tensor.data);
         }
         if matches!(entry.role, TensorRole::Plane(_) | TensorRole::TimePlane(_)) {
-            let mean = entry.with_quantized(readers, |quantized| quantized.mean(&tensor.data)).unwrap_or(0.0);
+            let mean = entry.with_quantized(points, |quantized| quantized.mean(&tensor.data)).unwrap_or(0.0);
             entry.mean = QuantizationGrid::new(entry.step).nearest(mean);
         }
-        if let Some(weights) = entry.with_quantized(readers, |quantized| quantized.fit(&mut tensor.data.clone())) {
+        if let Some(weights) = entry.with_quantized(points, |quantized| quantized.fit(&mut tensor.data.clone())) {
             entry.weights = weights;
             let before = encoder.cost();
-            entry.with_quantized(readers, |quantized| {
+            entry.with_quantized(points, |quantized| {
                 quantized.encode(&weights, shared.residuals(entry), &mut tensor.data.clone(), &mut encoder);
             });
             bits.insert(entry.name.clone(), encoder.cost() - before);
@@ -301,14 +305,14 @@ pub(super) fn encode(
     (encoder.finish(), exact)
 }
 
-/// Decodes the tensors of `entries` from the symbols `bytes` and the unquantized values `exact`. `readers` holds the
+/// Decodes the tensors of `entries` from the symbols `bytes` and the unquantized values `exact`. `points` holds the
 /// positions and times at which the deformation field is evaluated. Returns `None` if symbols or values do not match
 /// the entries, whose shapes the caller has checked.
 pub(super) fn decode(
     entries: &[TensorEntry],
     bytes: &[u8],
     mut exact: &[f32],
-    readers: &Readers<'_>,
+    points: &EvaluationPoints<'_>,
 ) -> Option<Tensors> {
     let mut decoder = SymbolDecoder::new(bytes)?;
     let mut shared = SharedModels(Vec::new());
@@ -321,7 +325,7 @@ pub(super) fn decode(
             own.to_vec()
         } else {
             let mut data = vec![0.0; count];
-            entry.with_quantized(readers, |quantized| {
+            entry.with_quantized(points, |quantized| {
                 quantized.decode(&entry.weights, shared.residuals(entry), &mut data, &mut decoder)
             });
             data
@@ -345,8 +349,8 @@ pub fn round_tensor(
     space: Option<Box3>,
 ) -> Tensor {
     let entry = TensorEntry::new("", tensor, role, Some(steps));
-    let readers = Readers { position, space, times: [-1.0, 1.0] };
+    let points = EvaluationPoints { position, space, times: [-1.0, 1.0] };
     let mut data = tensor.data.clone();
-    entry.with_quantized(&readers, |quantized| quantized.fit(&mut data));
+    entry.with_quantized(&points, |quantized| quantized.fit(&mut data));
     Tensor { shape: tensor.shape.clone(), data }
 }

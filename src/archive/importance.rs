@@ -257,7 +257,8 @@ impl Samples {
             for planes in &levels {
                 let channels = planes[0].shape[1];
                 let from = features.len() % width;
-                let read: Vec<Vec<f32>> = planes.iter().zip(AXES).map(|(plane, axes)| read(plane, axes, at)).collect();
+                let read: Vec<Vec<f32>> =
+                    planes.iter().zip(AXES).map(|(plane, axes)| sample_plane(plane, axes, at)).collect();
                 for c in 0..channels {
                     for (p, squares) in squares.iter_mut().enumerate() {
                         let others: f32 = (0..6).filter(|&q| q != p).map(|q| read[q][c]).product();
@@ -282,7 +283,7 @@ impl Samples {
 
 /// Returns the values of all channels of a plane over the axes `axes` at the point `at` (x, y, z, time), interpolated
 /// bilinearly.
-fn read(plane: &Tensor, axes: [usize; 2], at: [f32; 4]) -> Vec<f32> {
+fn sample_plane(plane: &Tensor, axes: [usize; 2], at: [f32; 4]) -> Vec<f32> {
     let [channels, rows, columns] = [plane.shape[1], plane.shape[2], plane.shape[3]];
     let (a, b): (TexelPair, TexelPair) = (texel_pair(at[axes[0]], columns), texel_pair(at[axes[1]], rows));
     let interpolated = |channel: usize| {

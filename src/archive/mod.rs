@@ -35,7 +35,7 @@ use crate::deform::{Box3, Tensor, Tensors};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, Gaussians};
-use field::{Readers, TensorEntry};
+use field::{EvaluationPoints, TensorEntry};
 use file::{ArchiveHeader, Damage, Sections};
 
 /// Name of the tensor that holds the box of space that the feature planes cover.
@@ -117,7 +117,7 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
     // Positions as a reader of the archive will decode them.
     let (stored, _) =
         cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("the encoded Gaussians cannot be decoded"))?;
-    let readers = Readers { position: &stored.position, space: field_box(content), times: content.times };
+    let points = EvaluationPoints { position: &stored.position, space: field_box(content), times: content.times };
     let entry = |(name, tensor): (&String, &Tensor)| {
         let role = content.field.get(name).copied().unwrap_or(TensorRole::Unread);
         TensorEntry::new(name, tensor, role, steps.field.0.get(name))
@@ -129,7 +129,7 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
             "an archive cannot hold tensor {name} of shape {shape:?}: its shape does not fit its use"
         )));
     }
-    let (field, exact) = field::encode(&mut entries, &content.tensors, &readers, &mut bits);
+    let (field, exact) = field::encode(&mut entries, &content.tensors, &points, &mut bits);
     let width = content.extra_bytes.len() / content.cloud.len().max(1);
     let table = Table {
         cloud: shape,
@@ -247,8 +247,8 @@ fn decoded(
     {
         return Err(unsound("box of the field"));
     }
-    let readers = Readers { position: &cloud.position, space, times: content.times };
-    content.tensors = field::decode(&table.tensors, &field, &exact, &readers).ok_or_else(|| unsound("field"))?;
+    let points = EvaluationPoints { position: &cloud.position, space, times: content.times };
+    content.tensors = field::decode(&table.tensors, &field, &exact, &points).ok_or_else(|| unsound("field"))?;
     content.field = table.tensors.into_iter().map(|entry| (entry.name, entry.role)).collect();
     (content.cloud, content.columns) = (cloud, columns);
     Ok((content, parts))
@@ -281,7 +281,7 @@ pub fn attribute_values(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32
 /// [`STEP_NUMBERS`]. The error names the value or the step.
 fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
     for column in Attributes::all().iter() {
-        let values = content.cloud.column(column);
+        let values = content.cloud.attribute_values(column);
         if let Some(at) = values.planes().iter().position(|value| !value.is_finite()) {
             let (id, value) = (at % values.len(), values.planes()[at]);
             return Err(Error::usage(format!(

@@ -29,7 +29,7 @@ fn tensor(noise: &mut NoiseGenerator, shape: &[usize]) -> Tensor {
 fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
     let mut noise = NoiseGenerator(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
-    for column in cloud.columns_mut(Attributes::all()) {
+    for column in cloud.selected_attribute_values_mut(Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * noise.next());
     }
     let mut content = ArchiveContent { cloud, times: [0.0, 1.0], ..ArchiveContent::default() };

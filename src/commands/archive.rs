@@ -127,7 +127,7 @@ pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) ->
             fs::write(staged.path(), &encoded.bytes).map_err(Error::io("write", staged.path()))?;
         }
         PreparedArchive::Frames(bounds) => {
-            write_within(&*scene.input.reduced(&all)?, bounds, staged.path(), &scene.events)?;
+            write_within(&*scene.input.compressed_frames(&all)?, bounds, staged.path(), &scene.events)?;
         }
     }
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();

@@ -66,7 +66,7 @@ pub fn convert(
     }
     let opened = open_input(input)?;
     let (model, source) = (&*opened.input, opened.input.source());
-    let own = match model.own_output() {
+    let own = match model.default_output_kind() {
         OutputKind::Gseq => OutputKind::PlySequence,
         own => own,
     };
@@ -122,7 +122,7 @@ fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstim
     fixed.push(("single frames", if kind == OutputKind::Tsog { single } else { 0 }));
     let per_gaussian = vec![
         ("kept", 16),
-        ("result", work.input.reduced + work.input.file + state_bytes),
+        ("result", work.input.compressed + work.input.file + state_bytes),
         ("readers", work.input.reader),
         ("held", if fits { 0 } else { work.kept_frames_bytes(limits, Attributes::all()) }),
         ("fitted", if fits { FITTED_BYTES } else { 0 }),

@@ -11,7 +11,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::ResourceEstimate;
-use crate::model::{Camera, FrameView, Rig, Shot};
+use crate::model::{Camera, FrameView, Rig, RigView};
 use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::progress::Events;
@@ -93,7 +93,7 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     check_target(output, TargetKind::File, &inputs, options.overwrite)?;
 
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
-    let own = shots_with_times(&mut opened, options.input.frames.is_some());
+    let own = views_with_times(&mut opened, options.input.frames.is_some());
     let mut scene = from_input(opened, &InputOptions { split: None, ..options.input.clone() })?;
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
@@ -105,8 +105,8 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
         vec![estimate]
     })?;
     let background = render_background(options.background, &scene)?;
-    let shots = shots(own.as_deref().unwrap_or(&scene.rig.shots), &scene.rig, options.views)?;
-    let (cameras, views) = plan_views(&options.path, &shots, &scene.rig, &scene.source().info().times)?;
+    let rig_views = rig_views(own.as_deref().unwrap_or(&scene.rig.views), &scene.rig, options.views)?;
+    let (cameras, views) = plan_views(&options.path, &rig_views, &scene.rig, &scene.source().info().times)?;
     let size = common_size(&cameras)?;
     let size = (size.0 * models as u32, size.1);
 
@@ -123,23 +123,23 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
 }
 
-/// Removes the times from the shots (pairs of a camera and a time) of `opened`, so that every camera can show every
-/// frame. Returns a copy of the shots with their times. `has_other_frames`: whether the user requested frames at other
+/// Removes the times from the views (pairs of a camera and a time) of `opened`, so that every camera can show every
+/// frame. Returns a copy of the views with their times. `has_other_frames`: whether the user requested frames at other
 /// times than those of the cameras. If not, or if there are no cameras, changes nothing and returns `None`.
-fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
+fn views_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<RigView>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
-    let own = rig.shots.clone();
-    rig.shots.iter_mut().for_each(|shot| shot.time = None);
+    let own = rig.views.clone();
+    rig.views.iter_mut().for_each(|rig_view| rig_view.time = None);
     Some(own)
 }
 
-/// Returns the shots (pairs of a camera and a time) in `all` that belong to the set `views`, sorted by view number,
-/// then by time; shots without a time come first. Fails if there are none.
-fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
+/// Returns the views (pairs of a camera and a time) in `all` that belong to the set `views`, sorted by view number,
+/// then by time; views without a time come first. Fails if there are none.
+fn rig_views(all: &[RigView], rig: &Rig, views: ViewSet) -> Result<Vec<RigView>> {
     let split = views.split(rig);
-    let mut found: Vec<Shot> =
-        all.iter().filter(|shot| split.is_none_or(|split| split == shot.split)).cloned().collect();
-    let time = |shot: &Shot| shot.time.unwrap_or(f64::NEG_INFINITY);
+    let mut found: Vec<RigView> =
+        all.iter().filter(|rig_view| split.is_none_or(|split| split == rig_view.split)).cloned().collect();
+    let time = |rig_view: &RigView| rig_view.time.unwrap_or(f64::NEG_INFINITY);
     found.sort_by(|a, b| a.view.cmp(&b.view).then(time(a).total_cmp(&time(b))));
     match found.is_empty() {
         true => {
@@ -149,24 +149,29 @@ fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     }
 }
 
-/// Plans a video of `shots` (pairs of a camera and a time). Returns the cameras of the video and, for each image in
+/// Plans a video of `rig_views` (pairs of a camera and a time). Returns the cameras of the video and, for each image in
 /// order, the frame of the model and the index of its camera. `times`: times of the frames.
 /// - For one view: one image per frame, from the camera of this view whose time is nearest.
 /// - For a path: one new camera per image, on a path through the cameras of the views that `path` lists.
-fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
+fn plan_views(
+    path: &VideoCamera,
+    rig_views: &[RigView],
+    rig: &Rig,
+    times: &[f64],
+) -> Result<(Vec<Camera>, Vec<FrameView>)> {
     match path {
         VideoCamera::View(view) => {
-            let view = view.unwrap_or_else(|| shots.first().map_or(0, |shot| shot.view));
-            let own = shots_of_view(shots, view, "--view", rig)?;
-            let time_distance = |shot: &Shot, time: f64| shot.time.map_or(0.0, |at| (at - time).abs());
+            let view = view.unwrap_or_else(|| rig_views.first().map_or(0, |rig_view| rig_view.view));
+            let own = views_with_number(rig_views, view, "--view", rig)?;
+            let time_distance = |rig_view: &RigView, time: f64| rig_view.time.map_or(0.0, |at| (at - time).abs());
             let nearest =
                 |time: f64| own.iter().min_by(|a, b| time_distance(a, time).total_cmp(&time_distance(b, time)));
-            let camera = |&time: &f64| nearest(time).map_or(0, |shot| shot.camera);
+            let camera = |&time: &f64| nearest(time).map_or(0, |rig_view| rig_view.camera);
             let film_view = |(frame, time)| FrameView { frame, view, camera: camera(time) };
             Ok((rig.cameras.clone(), times.iter().enumerate().map(film_view).collect()))
         }
         VideoCamera::Path(views) => {
-            let all = || shots.chunk_by(|a, b| a.view == b.view).map(|shots| shots[0].view).collect();
+            let all = || rig_views.chunk_by(|a, b| a.view == b.view).map(|rig_views| rig_views[0].view).collect();
             let views: Vec<u32> = if views.is_empty() { all() } else { views.clone() };
             if views.len() < 2 {
                 return Err(Error::usage(format!(
@@ -176,8 +181,9 @@ fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> R
                     rig.origin
                 )));
             }
-            let stop =
-                |&view: &u32| Ok(rig.cameras[shots_of_view(shots, view, "--path", rig)?[0].camera as usize].clone());
+            let stop = |&view: &u32| {
+                Ok(rig.cameras[views_with_number(rig_views, view, "--path", rig)?[0].camera as usize].clone())
+            };
             let stops = views.iter().map(stop).collect::<Result<Vec<Camera>>>()?;
             common_size(&stops)?;
             let count = if times.len() > 1 { times.len() } else { VIEWS_BETWEEN_STOPS * (stops.len() - 1) + 1 };
@@ -187,13 +193,13 @@ fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> R
     }
 }
 
-/// Returns the shots (pairs of a camera and a time) with the view number `view`. `shots` must be sorted by view number.
-/// Fails if there is no such shot; the message names the command line option `flag`.
-fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
-    let mut views = shots.chunk_by(|a, b| a.view == b.view);
-    views.find(|shots| shots[0].view == view).ok_or_else(|| {
+/// Returns the views (pairs of a camera and a time) with the view number `view`. `rig_views` must be sorted by view
+/// number. Fails if there is no such view; the message names the command line option `flag`.
+fn views_with_number<'a>(rig_views: &'a [RigView], view: u32, flag: &str, rig: &Rig) -> Result<&'a [RigView]> {
+    let mut views = rig_views.chunk_by(|a, b| a.view == b.view);
+    views.find(|rig_views| rig_views[0].view == view).ok_or_else(|| {
         let views: Vec<String> =
-            shots.chunk_by(|a, b| a.view == b.view).map(|shots| shots[0].view.to_string()).collect();
+            rig_views.chunk_by(|a, b| a.view == b.view).map(|rig_views| rig_views[0].view.to_string()).collect();
         Error::usage(format!("{flag} {view}: expected one of the views {} ({})", views.join(", "), rig.origin))
     })
 }

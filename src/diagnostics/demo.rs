@@ -202,8 +202,8 @@ fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options:
 /// Returns a JSON text with the cameras of `rig` and the split (training or test) of each view. The text gives no
 /// times: every camera sees every frame.
 fn cameras_json(rig: &Rig) -> String {
-    let frame = |shot: &crate::model::Shot| {
-        let camera = &rig.cameras[shot.camera as usize];
+    let frame = |rig_view: &crate::model::RigView| {
+        let camera = &rig.cameras[rig_view.camera as usize];
         let mut rows: Vec<[f64; 4]> = (0..3)
             .map(|row| {
                 let [a, b, c] = camera.rotation.row(row).to_array();
@@ -212,8 +212,8 @@ fn cameras_json(rig: &Rig) -> String {
             .collect();
         rows.push([0.0, 0.0, 0.0, 1.0]);
         serde_json::json!({
-            "v": shot.view,
-            "split": if shot.split == Split::Test { "test" } else { "train" },
+            "v": rig_view.view,
+            "split": if rig_view.split == Split::Test { "test" } else { "train" },
             "width": camera.width,
             "height": camera.height,
             "fx": camera.fx,
@@ -223,7 +223,7 @@ fn cameras_json(rig: &Rig) -> String {
             "w2c": rows,
         })
     };
-    let frames: Vec<serde_json::Value> = rig.shots.iter().map(frame).collect();
+    let frames: Vec<serde_json::Value> = rig.views.iter().map(frame).collect();
     format!("{:#}\n", serde_json::json!({ "background": rig.background, "frames": frames }))
 }
 

@@ -18,7 +18,7 @@ use crate::outputs::kind::OutputKind;
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::summary::Summary;
 use crate::pipeline::summary::SummaryDetail;
-use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
+use crate::pipeline::{CompressedScene, Request, Target, compress_scene, set_limits_within_budget};
 use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
@@ -81,8 +81,8 @@ pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
     Ok(report)
 }
 
-/// Writes the test scene `made` into the existing folder `folder`: its frames to the container `scene.gseq`, its cameras
-/// to `cameras.json`. Returns the paths of both files, in this order. Reports progress to `events`.
+/// Writes the test scene `made` into the existing folder `folder`: its frames to the container `scene.gseq`, its
+/// cameras to `cameras.json`. Returns the paths of both files, in this order. Reports progress to `events`.
 ///
 /// # Errors
 /// Fails if a file cannot be written.
@@ -107,7 +107,7 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
         ..Request::new(plain, folder.join("compressed.gseq"), options.recipe.clone())
     };
     set_limits_within_budget(&mut scene, &request)?;
-    let (mut summary, map) = compress_scene(&scene, &request)?;
+    let CompressedScene { mut summary, index_map: map } = compress_scene(&scene, &request)?;
     // The folder is still under its temporary name.
     summary.output.clear();
     let marker = folder.join(SUMMARY_FILE);

@@ -288,7 +288,7 @@ impl ModelPair {
         self.compute_sharded(name, |range| {
             let progress = self.scene.events.task(name, "views", range.len() as u64);
             let mut all = Vec::with_capacity(range.len());
-            self.show(&self.views[range], |views| {
+            self.for_each_batch(&self.views[range], |views| {
                 let observe_view = |view: &ViewStates<'_, 2>| {
                     let seen = observe(view.states[0], view.camera, &self.render_view(view)?);
                     progress.advance(1);
@@ -405,7 +405,7 @@ impl ModelPair {
         places.dedup();
         let chosen: Vec<FrameView> = places.iter().map(|&place| self.views[place]).collect();
         let mut found = Vec::with_capacity(chosen.len());
-        self.show(&chosen, |views| {
+        self.for_each_batch(&chosen, |views| {
             for view in views {
                 found.push(see(places[found.len()], view.states[0], view.camera, self.render_view(view)?));
             }
@@ -431,7 +431,7 @@ impl ModelPair {
         see: impl Fn([&Image; 2]) -> Result<O> + Sync,
     ) -> Result<Vec<O>> {
         let mut found = Vec::with_capacity(views.len());
-        self.show(views, |batch| {
+        self.for_each_batch(views, |batch| {
             let compare_view = |view: &ViewStates<'_, 2>| {
                 let images = [0, 1].map(|subject| view.render(subject, self.background));
                 see([&images[0], &images[1]])
@@ -458,7 +458,7 @@ impl ModelPair {
 
     /// Calls `visit` for all `views`, in order, with a batch of views at a time. For each view of a batch, `visit` gets
     /// the frame states of the original and of the compressed model.
-    fn show(&self, views: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
+    fn for_each_batch(&self, views: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all_gaussians);
         for_each_view_batch(subjects, &self.scene.rig.cameras, views, BatchLimits::one_frame(&self.scene.limits), visit)
     }
@@ -484,7 +484,7 @@ impl ModelPair {
         let mut observed = Vec::with_capacity(chosen.len() - again);
         let mut shown = 0;
         let progress = self.scene.events.task(NAME, "views", (chosen.len() - again) as u64);
-        self.show(&chosen, |views| {
+        self.for_each_batch(&chosen, |views| {
             let first = shown;
             shown += views.len();
             let rendered: Vec<_> = views

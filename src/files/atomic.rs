@@ -11,7 +11,7 @@
 
 mod destination;
 mod leftovers;
-mod named;
+mod ownership;
 mod publish;
 mod stream;
 mod warnings;
@@ -25,8 +25,8 @@ use destination::{Destination, check_replace, destination, real_parent};
 pub use destination::{Replace, TargetKind};
 use leftovers::clean_up;
 pub use leftovers::remove_leftovers;
-pub use named::SUMMARY_FILE;
-use named::{add_file_list, entries, exists, files_below, split_target};
+pub use ownership::SUMMARY_FILE;
+use ownership::{add_file_list, entries, exists, files_below, split_target};
 pub use stream::is_standard_output_used;
 pub use warnings::take_warnings;
 pub use workspace::{ExitGuard, remove_unfinished};

@@ -20,7 +20,7 @@ use half::{bf16, f16};
 use hashbrown::HashMap;
 use zip::{CompressionMethod, ZipArchive};
 
-use super::pickle::Wrong;
+use super::pickle::PickleError;
 pub(crate) use super::pickle::{MAX_DEPTH, Node, NodeId, Pickle};
 use super::shared_file::SharedFile;
 use super::zip_directory::declared_directory;
@@ -270,10 +270,12 @@ impl Checkpoint {
         let left = (memory.bytes() - listed - bytes) / 8 * 7;
         let bytes = read_entry(&mut archive, &file, pickle_index).map_err(|error| wrong(PICKLE, error.to_string()))?;
         let pickle = Pickle::read(&bytes, left).map_err(|error| match error {
-            Wrong::Malformed(at, found) => wrong(&format!("{PICKLE}, byte {at}"), found),
-            Wrong::TooMuch(at, expected, found) => Error::input(path, format!("{PICKLE}, byte {at}"), expected, found)
-                .hint("a trained model has far fewer: load the checkpoint and save its state dict alone"),
-            Wrong::Memory(at, taken) => {
+            PickleError::Malformed(at, found) => wrong(&format!("{PICKLE}, byte {at}"), found),
+            PickleError::TooMuch(at, expected, found) => {
+                Error::input(path, format!("{PICKLE}, byte {at}"), expected, found)
+                    .hint("a trained model has far fewer: load the checkpoint and save its state dict alone")
+            }
+            PickleError::Memory(at, taken) => {
                 let place = format!("{PICKLE}, byte {at}");
                 let whole = listed + bytes.len() as u64 + taken / 7 * 8 + 8;
                 memory.check(path, &place, "the values of the pickle", whole).err().unwrap_or_else(|| {

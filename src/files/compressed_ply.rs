@@ -21,7 +21,7 @@ use super::ply::header::{Element, PlyEncoding, PlyHeader, Property, Scalar};
 use super::sog::images::decode_opacity;
 use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
-use crate::model::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficients};
+use crate::model::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficient_count};
 
 /// Name of a PLY property that only `.compressed.ply` files have. A file with this property is read in this format.
 pub const MARKER_PROPERTY: &str = "packed_position";
@@ -99,7 +99,7 @@ pub fn read_compressed_ply(path: &Path, memory: ReadLimit) -> Result<Gaussians> 
         let expected = format!("{} chunks for {count} Gaussians", count.div_ceil(CHUNK));
         return Err(Error::input(path, "element chunk", expected, chunks.element.count.to_string()));
     }
-    let per_gaussian = 4 * (11 + 3 * sh_coefficients(MAX_SH_DEGREE) as u64);
+    let per_gaussian = 4 * (11 + 3 * sh_coefficient_count(MAX_SH_DEGREE) as u64);
     memory.check(path, "element vertex", "the Gaussians of the file", count as u64 * per_gaussian)?;
     let degree = table("sh").map_or(Ok(0), |table| sh_degree(table, count))?;
     let mut gaussians = Gaussians::zeros(count, degree);
@@ -186,7 +186,7 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
 /// if no degree has this number of coefficients, or if the element does not have one row for each of `count` Gaussians.
 fn sh_degree(table: &Table, count: usize) -> Result<usize> {
     let coefficients = table.element.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
-    let degree = (1..=MAX_SH_DEGREE).find(|&degree| 3 * (sh_coefficients(degree) - 1) == coefficients);
+    let degree = (1..=MAX_SH_DEGREE).find(|&degree| 3 * (sh_coefficient_count(degree) - 1) == coefficients);
     if table.element.count != count as u64 {
         return Err(Error::input(table.path, "element sh", format!("{count} rows"), table.element.count.to_string()));
     }

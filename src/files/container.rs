@@ -21,8 +21,8 @@
 //! A file that is in the page cache is read one frame block after another. When a reader that decodes whole frame
 //! blocks enters a block, it tells the system which block comes next, so that the system reads it ahead. A file that is
 //! not in the page cache is read in stages by a scan (pass over all frames): one thread fetches bytes from the disk
-//! before others need them ([`FrameSource::ahead`]). Times of a scan on the same machine, the first by frame blocks,
-//! the second in stages:
+//! before others need them ([`FrameSource::prefetcher`]). Times of a scan on the same machine, the first by frame
+//! blocks, the second in stages:
 //!
 //! | file | raw tiles, ms | compressed tiles, ms |
 //! |---|---|---|
@@ -42,7 +42,7 @@ pub use self::store::Container;
 use self::tiles::TileReader;
 use crate::error::Result;
 use crate::model::{Attributes, SequenceInfo};
-use crate::source::{BlockReader, FrameSource, Ids, Prefetch, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadCounts};
 
 /// Number of positions in the file that are sampled to find out whether the file is in the page cache.
 const CACHE_SAMPLES: u64 = 64;
@@ -56,14 +56,14 @@ impl FrameSource for Container {
         Ok(Box::new(TileReader::new(self, &ids)))
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         let read = self.reader.tiles_read();
-        Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
+        ReadCounts { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
     }
 
     /// Returns the prefetcher, with which a scan (pass over all frames) reads the file ahead in stages. Returns `None`
     /// if the file is in the page cache, where a scan in stages is not faster (times: see the module documentation).
-    fn ahead(&self) -> Option<&dyn Prefetch> {
+    fn prefetcher(&self) -> Option<&dyn Prefetch> {
         match self.reader.is_cached(CACHE_SAMPLES) {
             Some(true) => None,
             _ => Some(self),

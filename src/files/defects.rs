@@ -45,7 +45,7 @@ impl Defects {
 
     /// Counts the defects `found` in row `row`. Each defect is given by its name, whether the row is dropped because of
     /// it, and the reason.
-    pub fn add(&mut self, row: u32, found: &[(&str, bool, &str)]) {
+    pub fn add_row(&mut self, row: u32, found: &[(&str, bool, &str)]) {
         self.defective += usize::from(!found.is_empty());
         self.dropped += usize::from(found.iter().any(|&(_, dropped, _)| dropped));
         for &(what, dropped, why) in found {
@@ -117,9 +117,9 @@ mod tests {
     fn a_row_counts_once_per_defect_and_once_in_the_total() {
         let mut defects = Defects::new(1000);
         let (nan, wide) = (("NaN", true, "not drawn"), ("wide", false, "always visible"));
-        defects.add(3, &[nan, wide]);
-        defects.add(4, &[]);
-        (10..20).for_each(|row| defects.add(row, &[wide]));
+        defects.add_row(3, &[nan, wide]);
+        defects.add_row(4, &[]);
+        (10..20).for_each(|row| defects.add_row(row, &[wide]));
         assert_eq!((defects.defective, defects.dropped), (11, 1));
         let counts: Vec<(&str, usize)> = defects.kinds.iter().map(|kind| (&*kind.what, kind.rows)).collect();
         assert_eq!(counts, [("NaN", 1), ("wide", 11)]);
@@ -131,7 +131,7 @@ mod tests {
                 "11 of 1000 rows have defects: 1 (0.10%) left out, 10 repaired",
             ]
         );
-        (20..40).for_each(|row| defects.add(row, &[nan]));
+        (20..40).for_each(|row| defects.add_row(row, &[nan]));
         assert!(defects.notes()[0].starts_with("31 of 1000 rows have defects: 21 (2.10%) left out"));
         assert_eq!(Defects::new(7).notes(), [""; 0]);
     }

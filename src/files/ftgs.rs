@@ -220,7 +220,7 @@ fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<
     let mut defects = Defects::new(params.len());
     let columns: Vec<&AttributeValues> = Attributes::all()
         .iter()
-        .map(|column| params.gaussians.column(column))
+        .map(|column| params.gaussians.attribute_values(column))
         .chain([&params.format_specific])
         .collect();
     let zero = match zero_rotation {
@@ -233,7 +233,7 @@ fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<
         let found =
             [(!columns.iter().all(is_finite), NON_FINITE), (params.gaussians.rotation.row::<4>(row) == [0.0; 4], zero)];
         let found: Vec<_> = found.into_iter().filter_map(|(is_there, defect)| is_there.then_some(defect)).collect();
-        defects.add(row as u32, &found);
+        defects.add_row(row as u32, &found);
         if !found.iter().any(|&(_, dropped, _)| dropped) {
             kept.push(row as u32);
         }
@@ -304,7 +304,8 @@ mod tests {
             format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, count),
         };
         let mut next = 0.0f64;
-        let columns = made.gaussians.columns_mut(Attributes::all()).chain([&mut made.format_specific]);
+        let columns =
+            made.gaussians.selected_attribute_values_mut(Attributes::all()).chain([&mut made.format_specific]);
         for value in columns.flat_map(AttributeValues::planes_mut) {
             next = (next + 0.618_034).fract();
             *value = next as f32 - 0.4;

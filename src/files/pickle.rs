@@ -71,7 +71,7 @@ pub(crate) struct Pickle {
 
 /// Reason why a pickle cannot be read.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Wrong {
+pub(crate) enum PickleError {
     /// The pickle is malformed or contains an unsupported instruction: byte offset and description.
     Malformed(usize, String),
     /// The pickle exceeds a fixed limit: byte offset, the limit, and a description of what was found.
@@ -80,11 +80,11 @@ pub(crate) enum Wrong {
     Memory(usize, u64),
 }
 
-impl Wrong {
+impl PickleError {
     /// Builds the error for a pickle with malformed content at byte `at`. `found` describes the content for the
     /// message.
-    fn at(at: usize, found: impl Into<String>) -> Wrong {
-        Wrong::Malformed(at, found.into())
+    fn at(at: usize, found: impl Into<String>) -> PickleError {
+        PickleError::Malformed(at, found.into())
     }
 }
 
@@ -94,9 +94,9 @@ impl Pickle {
     /// # Errors
     /// Fails if the bytes end too early, refer to values that do not exist, or contain an instruction that no tensor
     /// needs, or if the number of instructions, the nesting depth or the memory exceeds its limit.
-    pub(crate) fn read(bytes: &[u8], memory: u64) -> Result<Pickle, Wrong> {
+    pub(crate) fn read(bytes: &[u8], memory: u64) -> Result<Pickle, PickleError> {
         if u32::try_from(bytes.len()).is_err() {
-            return Err(Wrong::TooMuch(0, "a pickle below 4 GiB".into(), format!("{} bytes", bytes.len())));
+            return Err(PickleError::TooMuch(0, "a pickle below 4 GiB".into(), format!("{} bytes", bytes.len())));
         }
         PickleMachine::new(bytes, memory.min(MAX_MEMORY)).read()
     }

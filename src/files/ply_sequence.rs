@@ -10,7 +10,7 @@ use super::ply::{Ply, PlyOptions, check_ids};
 use super::ply_frames::PlyFrames;
 use crate::error::{Error, Result, ShowPath};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
-use crate::source::{BlockReader, FrameSource, Ids, Reads, SharedCounter};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, SharedCounter};
 
 /// Dynamic scene stored as one PLY file per frame, with the same Gaussians in every file.
 #[derive(Debug)]
@@ -121,8 +121,8 @@ impl FrameSource for PlySequence {
         Ok(Box::new(PlyBlock { sequence: self, ids: OwnedIds::from_ids(ids) }))
     }
 
-    fn reads(&self) -> Reads {
-        Reads { bytes: self.bytes.get(), states: self.states.get(), ..Reads::default() }
+    fn reads(&self) -> ReadCounts {
+        ReadCounts { bytes: self.bytes.get(), states: self.states.get(), ..ReadCounts::default() }
     }
 }
 

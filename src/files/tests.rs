@@ -1,14 +1,14 @@
 //! Gaussians and checks that the tests of several file formats share.
 
 use crate::diagnostics::demo_scene::DemoScene;
-use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficients};
+use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficient_count};
 use crate::passes::gather_all;
 
 /// Returns `count` Gaussians with SH degree `degree`. Their values differ along all axes, so that a swapped or reversed
 /// axis is noticed.
 pub(super) fn gaussians_with_sh(count: usize, degree: usize) -> Gaussians {
     let mut state = gather_all(&DemoScene::new(count, 1), 0, Attributes::all()).unwrap();
-    state.sh = AttributeValues::zeros(3 * sh_coefficients(degree), count);
+    state.sh = AttributeValues::zeros(3 * sh_coefficient_count(degree), count);
     state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
     state
 }

@@ -447,7 +447,7 @@ impl<'a> TrackFit<'a> {
             let apart = 1.0 - exp(-shown) - track.opacity[frame];
             if self.visible[frame] || apart > MIN_VISIBLE_OPACITY {
                 worst = worst.max(apart.abs() / tolerance.opacity);
-                misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
+                misfit.add_state(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
             }
             if worst > limit {
                 return None;
@@ -499,12 +499,12 @@ mod tests {
         let mut misfit = FitError::default();
         let one = fit_curves(&track(60, cubic, |_| 0.8), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!(one.len() == 1 && one[0].width.is_infinite() && (one[0].opacity - 0.8).abs() < 1e-9);
-        assert!(misfit.position < 1e-3 && misfit.states == 60, "{misfit:?}");
+        assert!(misfit.max_position_error < 1e-3 && misfit.states == 60, "{misfit:?}");
         let fading = track(60, cubic, |t| 0.9 * window(t, 0.4, 0.15));
         let one = fit_curves(&fading, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].center - 0.4).abs() < 1e-3 && (one[0].width - 0.15).abs() < 2e-3, "{:?}", one[0]);
-        assert!((one[0].opacity - 0.9).abs() < 0.01 && misfit.opacity < 0.01);
+        assert!((one[0].opacity - 0.9).abs() < 0.01 && misfit.max_opacity_error < 0.01);
     }
 
     #[test]
@@ -513,11 +513,11 @@ mod tests {
         let mut misfit = FitError::default();
         let many = fit_curves(&track(120, wave, |_| 0.6), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!((4..=33).contains(&many.len()), "{} curves", many.len());
-        assert!(misfit.opacity < 0.05 && misfit.rms() < 0.1, "{misfit:?}");
+        assert!(misfit.max_opacity_error < 0.05 && misfit.rms() < 0.1, "{misfit:?}");
         let mut misfit = FitError::default();
         let half_seen = track(120, |_| [0.0; 3], |t| if t < 0.5 { 0.7 } else { 0.0 });
         let step = fit_curves(&half_seen, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
-        assert!(step.len() > 2 && misfit.opacity < 0.4, "{} curves, {misfit:?}", step.len());
+        assert!(step.len() > 2 && misfit.max_opacity_error < 0.4, "{} curves, {misfit:?}", step.len());
     }
 
     #[test]
@@ -562,7 +562,7 @@ mod tests {
         assert_eq!(one.len(), 1);
         assert!((one[0].center + 0.1).abs() < 1e-6 && (one[0].width - 0.6).abs() < 1e-6, "{:?}", one[0]);
         assert!((one[0].opacity - 0.8).abs() < 1e-6 && (one[0].position[1][0] - 2.0).abs() < 1e-2, "{:?}", one[0]);
-        assert!(misfit.opacity < 1e-6 && misfit.position < 0.05, "{misfit:?}");
+        assert!(misfit.max_opacity_error < 1e-6 && misfit.max_position_error < 0.05, "{misfit:?}");
     }
 
     #[test]
@@ -575,6 +575,6 @@ mod tests {
             assert_eq!((&line.position[2..], line.rotation[1]), (&[[0.0; 3]; 2][..], [0.0; 4]));
             assert!(line.width >= 0.1, "{}", line.width);
         }
-        assert!(misfit.rms() < 1.0 && misfit.opacity < 0.1, "{misfit:?}");
+        assert!(misfit.rms() < 1.0 && misfit.max_opacity_error < 0.1, "{misfit:?}");
     }
 }

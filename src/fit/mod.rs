@@ -75,15 +75,15 @@ pub struct FitError {
     /// Gaussian.
     opacity_squares: f64,
     /// Sum of the Gaussian's opacity over all compared states.
-    visible: f64,
+    opacity_sum: f64,
     /// Sum of the Gaussian's opacity over those compared states in which the fit is far off: one of its errors exceeds
     /// [`FAR`].
-    far: f64,
+    far_opacity_sum: f64,
     /// Largest distance, over all compared states, between the positions of the fit and of the Gaussian, in units of
     /// the Gaussian's middle scale (the middle one of its three scales).
-    pub position: f64,
+    pub max_position_error: f64,
     /// Largest difference, over all compared states, between the opacities of the fit and of the Gaussian.
-    pub opacity: f64,
+    pub max_opacity_error: f64,
 }
 
 impl FitError {
@@ -91,14 +91,14 @@ impl FitError {
     /// the Gaussian, in units of the Gaussian's middle scale (the middle one of its three scales). `opacity`:
     /// difference between the opacities of the fit and of the Gaussian. `visible`: opacity of the Gaussian, its weight
     /// in [`FitError::far_off_fraction`].
-    pub(crate) fn add(&mut self, position: f64, opacity: f64, visible: f64) {
-        self.visible += visible;
-        self.far += if position > FAR[0] || opacity.abs() > FAR[1] { visible } else { 0.0 };
+    pub(crate) fn add_state(&mut self, position: f64, opacity: f64, visible: f64) {
+        self.opacity_sum += visible;
+        self.far_opacity_sum += if position > FAR[0] || opacity.abs() > FAR[1] { visible } else { 0.0 };
         self.states += 1;
         self.squares += position * position;
         self.opacity_squares += opacity * opacity;
-        self.position = self.position.max(position);
-        self.opacity = self.opacity.max(opacity.abs());
+        self.max_position_error = self.max_position_error.max(position);
+        self.max_opacity_error = self.max_opacity_error.max(opacity.abs());
     }
 
     /// Returns the errors over the states of both `self` and `other`: adds the counts and sums, and takes the larger
@@ -108,10 +108,10 @@ impl FitError {
             states: self.states + other.states,
             squares: self.squares + other.squares,
             opacity_squares: self.opacity_squares + other.opacity_squares,
-            visible: self.visible + other.visible,
-            far: self.far + other.far,
-            position: self.position.max(other.position),
-            opacity: self.opacity.max(other.opacity),
+            opacity_sum: self.opacity_sum + other.opacity_sum,
+            far_opacity_sum: self.far_opacity_sum + other.far_opacity_sum,
+            max_position_error: self.max_position_error.max(other.max_position_error),
+            max_opacity_error: self.max_opacity_error.max(other.max_opacity_error),
         }
     }
 
@@ -126,7 +126,7 @@ impl FitError {
     /// three scales), or its opacity by more than 0.1. Because of the weight, faint Gaussians hardly count in this
     /// fraction, unlike in the other errors.
     pub fn far_off_fraction(&self) -> f64 {
-        self.far / self.visible.max(f64::MIN_POSITIVE)
+        self.far_opacity_sum / self.opacity_sum.max(f64::MIN_POSITIVE)
     }
 
     /// Returns the root mean square difference between the opacities of the fit and of the Gaussian, over all compared

@@ -40,7 +40,7 @@ pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitErr
     add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
     for piece in &pieces {
         for frame in piece.frames.clone() {
-            misfit.add(
+            misfit.add_state(
                 track.distance_in_middle_scales(frame, position_at(piece, track.times[frame])),
                 track.opacity[frame] - piece.opacity,
                 track.opacity[frame],
@@ -139,13 +139,15 @@ mod tests {
         let mut misfit = FitError::default();
         let one = fit_lines(&track(50, |t| [1.0 + 2.0 * t, -t, 0.0], |_| 0.7), &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
-        assert!((one[0].velocity[0] - 2.0).abs() < 1e-9 && one[0].frames == (0..50) && misfit.position < 1e-9);
+        assert!(
+            (one[0].velocity[0] - 2.0).abs() < 1e-9 && one[0].frames == (0..50) && misfit.max_position_error < 1e-9
+        );
         let bent = track(50, |t| [(t - 0.4).abs(), 0.0, 0.0], |_| 0.7);
         let pieces = fit_lines(&bent, &Tolerance::default(), &mut misfit);
         // The motion bends in frame 20, so the pieces are frames 0 to 15, 16 to 19, and from 20 on.
         assert!(pieces.len() >= 3 && pieces.len() <= 8, "{} pieces", pieces.len());
         assert_eq!(pieces.iter().map(|piece| piece.frames.len()).sum::<usize>(), 50);
-        assert!(misfit.position <= 0.1 && misfit.states == 100, "{misfit:?}");
+        assert!(misfit.max_position_error <= 0.1 && misfit.states == 100, "{misfit:?}");
     }
 
     #[test]
@@ -172,6 +174,9 @@ mod tests {
         let pieces = fit_lines(&wild, &Tolerance::default(), &mut misfit);
         assert!(pieces.iter().all(|piece| is_within(&wild, piece, &Tolerance::default()) || piece.frames.len() == 1));
         assert!(pieces.windows(2).all(|pair| pair[0].frames.end == pair[1].frames.start));
-        assert!(misfit.position <= 0.1 && misfit.opacity <= 0.02 && misfit.states == 200, "{misfit:?}");
+        assert!(
+            misfit.max_position_error <= 0.1 && misfit.max_opacity_error <= 0.02 && misfit.states == 200,
+            "{misfit:?}"
+        );
     }
 }

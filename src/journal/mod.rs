@@ -19,7 +19,7 @@ use crate::journal::records::{
 };
 use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
-use crate::source::{FrameSource, Reads};
+use crate::source::{FrameSource, ReadCounts};
 
 /// Clock that measures the wall-clock time and the processor time of a piece of work.
 #[derive(Debug, Clone, Copy)]
@@ -60,7 +60,7 @@ pub struct Journal {
     /// Amounts that one full read of the input (every frame once) takes: bytes, tiles (compressed blocks of values),
     /// and states (one Gaussian at one frame). The reads of a stage are reported as multiples of these amounts.
     #[serde(skip)]
-    pub whole: Reads,
+    pub whole: ReadCounts,
     /// Records of the stages that have run, in order.
     pub stages: Vec<StageRecord>,
     /// Stages that the run omitted, with reasons.
@@ -168,7 +168,7 @@ impl Journal {
 
     /// Adds an entry for the opening of the input, as the stage `name`. `start`: stopwatch that was started before the
     /// opening. `gaussians`: number of Gaussians found. `reads`: amounts that were read.
-    pub fn record_opening(&mut self, name: &'static str, start: Stopwatch, gaussians: usize, reads: Reads) {
+    pub fn record_opening(&mut self, name: &'static str, start: Stopwatch, gaussians: usize, reads: ReadCounts) {
         self.record_stage(name, [0, gaussians], start, reads, 0);
     }
 
@@ -190,10 +190,10 @@ impl Journal {
         name: &str,
         [gaussians_in, gaussians_out]: [usize; 2],
         start: Stopwatch,
-        reads: Reads,
+        reads: ReadCounts,
         scratch_bytes: u64,
     ) {
-        let Reads { bytes, states, .. } = self.whole;
+        let ReadCounts { bytes, states, .. } = self.whole;
         let (read, whole) = if bytes > 0 { (reads.bytes, bytes) } else { (reads.states, states) };
         self.stages.push(StageRecord {
             name: name.to_owned(),

@@ -5,7 +5,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::metrics::decibels_text;
 use crate::progress::format_duration;
-use crate::source::Reads;
+use crate::source::ReadCounts;
 
 /// Time, memory, reads and counts of one stage of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -17,7 +17,7 @@ pub struct StageRecord {
     /// Number of Gaussians after the stage.
     pub gaussians_out: usize,
     /// Amounts that the stage read from the input, counted by the code that reads.
-    pub reads: Reads,
+    pub reads: ReadCounts,
     /// Amount that the stage read from the input, as a multiple of one full read (every frame once). It is measured in
     /// bytes if the input is stored in tiles (compressed blocks), otherwise in states (one Gaussian at one frame).
     pub full_reads: f64,
@@ -146,8 +146,8 @@ pub struct RefinedSummary {
     pub result: f64,
 }
 
-/// PSNR against photographs before and after the model was fitted to photographs, measured on photographs that were held
-/// back from the fit.
+/// PSNR against photographs before and after the model was fitted to photographs, measured on photographs that were
+/// held back from the fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PhotographSummary {
     /// Number of photographs that were held back, which are used to choose the best state but not to fit.
@@ -295,7 +295,7 @@ pub struct TermSummary {
 /// Numbers of Gaussians with unusual values, one number for each kind of unusual value. A Gaussian can count for
 /// several kinds.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub struct FlagSummary {
+pub struct UnusualValueCounts {
     /// Number of Gaussians with NaN or infinity in some frame.
     pub non_finite: usize,
     /// Number of Gaussians with a zero quaternion as rotation in some frame.

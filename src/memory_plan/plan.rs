@@ -136,7 +136,7 @@ impl MemoryPlan {
 
     /// Returns the maximum number of times that the whole input is read, summed over all stages. It is at most 1 if all
     /// decoded tiles (stored blocks of the input) stay in memory.
-    pub fn full_reads(&self) -> f64 {
+    pub fn whole_input_reads(&self) -> f64 {
         let sum: f64 = self.estimates.iter().map(|estimate| estimate.reads).sum();
         if self.limits.keeps_tiles { sum.min(1.0) } else { sum }
     }
@@ -233,7 +233,7 @@ impl MemoryPlan {
         let named: Vec<String> = reads.map(|estimate| format!("{:.2} {}", estimate.reads, estimate.stage)).collect();
         let held = if limits.keeps_tiles { "all decoded tiles stay in memory; otherwise " } else { "" };
         let named = named.join(" + ");
-        let _ = writeln!(out, "full reads of the input: at most {:.2} ({held}{named})", self.full_reads());
+        let _ = writeln!(out, "full reads of the input: at most {:.2} ({held}{named})", self.whole_input_reads());
         out
     }
 

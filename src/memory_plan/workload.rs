@@ -56,7 +56,7 @@ pub struct Workload {
     pub views: u64,
     /// Total number of views over all frames.
     pub frame_views: u64,
-    /// Bytes of memory that the cameras and the list of their shots (views of the scene) take, see [`Rig::bytes`].
+    /// Bytes of memory that the cameras and the list of the views of the scene take, see [`Rig::bytes`].
     pub rig: u64,
     /// Number of threads that share the work.
     pub threads: u64,
@@ -97,7 +97,7 @@ impl Workload {
     }
 
     fn seen_by(self, rig: &Rig, views: u64, pairs: u64) -> Workload {
-        let mut numbers: Vec<u32> = rig.shots.iter().map(|shot| shot.view).collect();
+        let mut numbers: Vec<u32> = rig.views.iter().map(|rig_view| rig_view.view).collect();
         numbers.sort_unstable();
         numbers.dedup();
         let pixels = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
@@ -115,10 +115,10 @@ impl Workload {
     /// will be packed into a container whose tiles hold `frame_block` frames each. `frames` is the assumed number of
     /// frames; 0: unknown.
     pub fn from_stream_header(header: &StreamHeader, frame_block: usize, rig: &Rig, frames: u64) -> Workload {
-        let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
+        let mut times: Vec<f64> = rig.views.iter().filter_map(|rig_view| rig_view.time).collect();
         times.sort_by(f64::total_cmp);
         let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
-        let timeless = rig.shots.len() - times.len();
+        let timeless = rig.views.len() - times.len();
         let views = (together + timeless) as u64;
         let pairs = if frames > 0 { timeless as u64 * frames + times.len() as u64 } else { 0 };
         let StreamHeader { count, sh_degree, varying, .. } = *header;
@@ -231,7 +231,7 @@ impl Workload {
     /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames. It is
     /// below 1 if only a part of the input is read. A tile (stored block of Gaussians × frames) is always read as a
     /// whole. It is read several times if readers may keep only some of its frames ([`Limits::max_kept_frames`]).
-    pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
+    pub fn whole_input_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
             return frames.min(all) as f64 / all as f64;
@@ -243,11 +243,12 @@ impl Workload {
     }
 
     /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames, for a
-    /// stage that reads blocks of Gaussians with arbitrary ids. It is twice [`Workload::full_reads`] for an input with
-    /// tiles (stored blocks): a tile may contain Gaussians of two such blocks, and is then read for each of them.
-    pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
+    /// stage that reads blocks of Gaussians with arbitrary ids. It is twice [`Workload::whole_input_reads`] for an
+    /// input with tiles (stored blocks): a tile may contain Gaussians of two such blocks, and is then read for each of
+    /// them.
+    pub fn scattered_whole_input_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
-        shared * self.full_reads(frames, limits)
+        shared * self.whole_input_reads(frames, limits)
     }
 
     /// Returns the time in seconds on one processor core for rendering `views` views of `gaussians` Gaussians. The last

@@ -12,11 +12,11 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::merging::proxy::{ProxyState, merge_state};
+use crate::merging::proxy::{ProxyState, merge_member_states};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::passes::FrameReaders;
 use crate::recipe::{MergeParams, ProxyPosition};
-use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 
 /// Attributes of a proxy (Gaussian that replaces a merged cluster) that are always computed together: all except SH.
 /// Position, rotation and scale follow from mean and covariance of the members; the opacity follows from the members'
@@ -106,7 +106,7 @@ impl FrameSource for MergedSequence<'_> {
         Some(self.open_together(0..self.survivors.len(), wanted))
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.source.reads()
     }
 }
@@ -158,7 +158,7 @@ impl MergedMembers {
     /// `merge` for proxies (Gaussians that replace merged clusters), and writes them to `out`.
     fn write(&self, state: &Gaussians, want: Attributes, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
-            let (from, to) = (state.column(column), out.column_mut(column));
+            let (from, to) = (state.attribute_values(column), out.attribute_values_mut(column));
             to.resize(self.rows.len());
             for c in 0..from.width() {
                 let plane = from.plane(c);
@@ -172,7 +172,7 @@ impl MergedMembers {
             let made: Vec<ProxyState> = batch
                 .par_iter()
                 .map(|proxy| {
-                    merge_state(&self.members[proxy.members.clone()], state, self.rows[proxy.row], merge, want)
+                    merge_member_states(&self.members[proxy.members.clone()], state, self.rows[proxy.row], merge, want)
                 })
                 .collect();
             batch.iter().zip(&made).for_each(|(proxy, made)| made.write(want, proxy.row, out));

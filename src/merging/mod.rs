@@ -394,7 +394,7 @@ fn each_candidate<E>(
 
 /// Returns whether all attribute values of the Gaussian in row `row` of `states` are finite.
 pub fn is_finite(states: &Gaussians, row: usize) -> bool {
-    let columns = Attributes::all().iter().map(|column| states.column(column));
+    let columns = Attributes::all().iter().map(|column| states.attribute_values(column));
     columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))
 }
 

@@ -132,7 +132,7 @@ fn unit_from_axes(frame: &DMat3) -> DQuat {
 ///
 /// A deformation field adds its deltas axis by axis. So the axes of a merged Gaussian must be in the same order as
 /// those of the Gaussian whose deltas it gets.
-pub fn align_axes(ellipsoid: &Ellipsoid, reference: DQuat) -> Ellipsoid {
+pub fn reorder_axes_to_match(ellipsoid: &Ellipsoid, reference: DQuat) -> Ellipsoid {
     let axes = DMat3::from_quat(ellipsoid.rotation);
     let (mut closest, mut rotation, mut scales) = (f64::NEG_INFINITY, ellipsoid.rotation, ellipsoid.scales);
     for order in [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]] {
@@ -246,7 +246,7 @@ mod tests {
         #[test]
         fn aligning_permutes_axes_to_within_63_degrees(parts in mixture(), reference in unit_quaternion()) {
             let got = moments(&parts, None);
-            let aligned = align_axes(&got, reference);
+            let aligned = reorder_axes_to_match(&got, reference);
             assert_covariance(&aligned, covariance(got.rotation, got.scales));
             // The rotation farthest from the 24 rotations of the cube is 62.8 degrees away.
             prop_assert!(aligned.rotation.dot(reference) > (62.9f64.to_radians() / 2.0).cos());
@@ -258,7 +258,7 @@ mod tests {
         for rotation in [DQuat::IDENTITY, tilt()] {
             for order in [DVec3::new(1e6, 1.0, 1e-6), DVec3::new(1e-6, 1e6, 1e-6), DVec3::new(1e-6, 3e-6, 1e6)] {
                 let needle = part(0.5, DVec3::new(1.0, 2.0, 3.0), rotation, order);
-                let got = align_axes(&moments(&[needle, needle], None), rotation);
+                let got = reorder_axes_to_match(&moments(&[needle, needle], None), rotation);
                 let error = ((got.scales - order) / order).abs().max_element();
                 assert!(error < 1e-12, "got {:?}, expected {order:?}, relative error {error:e}", got.scales);
             }

@@ -13,10 +13,11 @@ use rayon::prelude::*;
 use super::appearance::COSINE_EPSILON;
 use crate::recipe::{self, MotionParams, MotionSimilarity};
 
-/// Bytes of memory that [`PairMotion`] takes for each pair of nodes (Gaussians or merged groups) whose motion it
-/// measures.
+/// Bytes of memory that [`PairMotionAccumulator`] takes for each pair of nodes (Gaussians or merged groups) whose
+/// motion it measures.
 pub const PAIR_BYTES: usize = size_of::<NodePair>();
-/// Bytes of memory that [`PairMotion`] takes for each node (Gaussian or merged group) whose motion it follows.
+/// Bytes of memory that [`PairMotionAccumulator`] takes for each node (Gaussian or merged group) whose motion it
+/// follows.
 pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 
 /// Motion of two Gaussians relative to each other. A velocity is a step a = x(t) − x(t−1) between consecutive frames.
@@ -135,16 +136,16 @@ struct NodePair {
 
 /// Measurement of the motion of pairs of nodes (Gaussians or merged groups), to which the frames are added in order.
 #[derive(Debug)]
-pub struct PairMotion {
+pub struct PairMotionAccumulator {
     motion: MotionParams,
     frames: usize,
     tracks: Vec<NodeTrack>,
     pairs: Vec<NodePair>,
 }
 
-impl PairMotion {
+impl PairMotionAccumulator {
     /// Starts to measure the motion of each pair of nodes (Gaussians or merged groups), for its [`RelativeMotion`].
-    /// Frames are then added with [`PairMotion::add_frame`].
+    /// Frames are then added with [`PairMotionAccumulator::add_frame`].
     /// - `pairs` yields the indices of the two nodes of each pair.
     /// - `reference` yields the position of every node at the reference frame.
     /// - `motion` selects the steps (from one frame to the next) that count. With `Literal`, these are all steps that
@@ -167,7 +168,7 @@ impl PairMotion {
             union: 0,
             drift_squared: 0.0,
         };
-        PairMotion {
+        PairMotionAccumulator {
             motion,
             frames: 0,
             tracks: reference.map(track).collect(),
@@ -265,7 +266,7 @@ mod tests {
             ([x, 0.0, 0.0], alive)
         };
         let reference = (0..2).map(|node| state(0, node).0);
-        let mut pairs = PairMotion::new([(0, 1)].into_iter(), reference, motion);
+        let mut pairs = PairMotionAccumulator::new([(0, 1)].into_iter(), reference, motion);
         for t in 0..a.len() {
             pairs.add_frame(|node| state(t, node));
         }

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use super::trajectories::{NEEDED, Trajectories};
 use crate::error::Result;
-use crate::merging::motion::{MotionThresholds, NODE_BYTES, PAIR_BYTES, PairMotion};
+use crate::merging::motion::{MotionThresholds, NODE_BYTES, PAIR_BYTES, PairMotionAccumulator};
 use crate::merging::similarity_cache::PairSimilarity;
 use crate::merging::voxels::voxel_order;
 use crate::model::{AttributeValues, opacity};
@@ -104,7 +104,7 @@ impl PairMeter<'_> {
         let Some(GatheredTrajectories { trajectories, order, place }) = &mut self.gathered else {
             let rows = members(&pairs);
             let places = rows.iter().map(|&row| reference.row(row as usize));
-            let mut motion = PairMotion::new(local_indices(&pairs, &rows), places, self.scan.motion);
+            let mut motion = PairMotionAccumulator::new(local_indices(&pairs, &rows), places, self.scan.motion);
             self.play_source(&rows.iter().map(|&row| ids[row as usize]).collect::<Vec<u32>>(), &mut motion)?;
             let measured = motion.finish().map(|pair| self.gate.similarity(&pair));
             return Ok(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)).collect());
@@ -116,7 +116,7 @@ impl PairMeter<'_> {
         pairs.par_sort_unstable();
         let places = members(&pairs);
         let at = places.iter().map(|&k| reference.row(order[k as usize] as usize));
-        let mut motion = PairMotion::new(local_indices(&pairs, &places), at, self.scan.motion);
+        let mut motion = PairMotionAccumulator::new(local_indices(&pairs, &places), at, self.scan.motion);
         trajectories.play(&places, |moments| {
             motion.add_frame(|node| {
                 let [x, y, z, logit] = moments[node];
@@ -149,7 +149,7 @@ impl PairMeter<'_> {
 
     /// Passes every frame of the Gaussians `ids` of the source to `motion`. Passes only the first frame if neither
     /// positions nor opacities vary with time.
-    fn play_source(&self, ids: &[u32], motion: &mut PairMotion) -> Result<()> {
+    fn play_source(&self, ids: &[u32], motion: &mut PairMotionAccumulator) -> Result<()> {
         let info = self.source.info();
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
@@ -252,7 +252,7 @@ mod tests {
         fn measure_whole(&self) -> Vec<(u32, u32, u64)> {
             let gate = MotionThresholds::new(&self.recipe.merge, 4.0);
             let reference = (0..self.ids.len()).map(|i| self.reference.row(i));
-            let mut motion = PairMotion::new(self.pairs.iter().copied(), reference, self.recipe.scan.motion);
+            let mut motion = PairMotionAccumulator::new(self.pairs.iter().copied(), reference, self.recipe.scan.motion);
             for frame in 0..self.scene.info().times.len() {
                 let state = gather(&self.scene, &self.ids, frame, NEEDED).unwrap();
                 let alive = |i| opacity(state.opacity_logit.plane(0)[i]) >= self.recipe.scan.alpha_min;

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use super::MergeGroups;
 use super::appearance::unit_rotation;
-use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
+use super::moments::{Ellipsoid, WeightedGaussian, moments, reorder_axes_to_match};
 use crate::model::{self, Attributes, Gaussians};
 use crate::recipe::{self, ProxyHigherSh, ProxyOpacity, ProxyPosition};
 
@@ -116,7 +116,7 @@ pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians)
 ///
 /// Colors are computed only if `want` contains them: they are slow to read, and in most sequences they are the same at
 /// every frame.
-pub fn merge_state(
+pub fn merge_member_states(
     members: &[(u32, f64)],
     states: &Gaussians,
     leader: u32,
@@ -142,7 +142,7 @@ pub fn merge_state(
         ProxyPosition::Mean => None,
         ProxyPosition::Leader => Some(DVec3::ZERO),
     };
-    let local = align_axes(&moments(&parts, about), DQuat::IDENTITY);
+    let local = reorder_axes_to_match(&moments(&parts, about), DQuat::IDENTITY);
     ProxyState {
         position: origin + frame * local.mean,
         rotation: nearest_sign(frame * local.rotation, frame),
@@ -176,7 +176,7 @@ pub fn merge_groups(
                 let rows = groups.members(group);
                 let weights = weights(rows, importance, states);
                 let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
-                merge_state(&members, states, groups.leaders()[group], merge, Attributes::all())
+                merge_member_states(&members, states, groups.leaders()[group], merge, Attributes::all())
             })
             .collect();
         for (row, proxy) in (first..).zip(&proxies) {
@@ -295,7 +295,8 @@ mod tests {
                 for scale in [[-3.0, -5.0, -4.0], [-4.0, -4.0, -9.0], [0.0; 3]] {
                     let mut states = copies(3, scale, [0.9, -1.3, 0.2, 0.4]);
                     states.opacity_logit.plane_mut(0).fill(logit(0.2) as f32);
-                    let got = merge_state(&equal_weights(3), &states, 1, &recipe(placement, rule), Attributes::all());
+                    let got =
+                        merge_member_states(&equal_weights(3), &states, 1, &recipe(placement, rule), Attributes::all());
                     assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(1));
                     assert_eq!(got.log_scale.map(|x| x as f32), scale);
                     assert_eq!(got.sh.iter().map(|&x| x as f32).collect::<Vec<_>>(), states.sh.row::<12>(1));
@@ -316,9 +317,14 @@ mod tests {
             for logit in [f32::MIN, -200.0, 0.0, 200.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY] {
                 let mut states = copies(2, [0.0, -1.0, -2.0], [1.0, 0.0, 0.0, 0.0]);
                 states.opacity_logit.plane_mut(0).fill(logit);
-                let got =
-                    merge_state(&equal_weights(2), &states, 0, &recipe(ProxyPosition::Mean, rule), Attributes::all())
-                        .opacity_logit;
+                let got = merge_member_states(
+                    &equal_weights(2),
+                    &states,
+                    0,
+                    &recipe(ProxyPosition::Mean, rule),
+                    Attributes::all(),
+                )
+                .opacity_logit;
                 assert!(got.is_finite() && got.abs() < 17.0, "{rule:?} of {logit}: {got}");
             }
         }
@@ -331,7 +337,7 @@ mod tests {
             [needle, [1e-12f32.ln(); 3], [1e6f32.ln(); 3], [1e6f32.ln(), 1e-12f32.ln(), 1e-12f32.ln()], [-800.0; 3]]
         {
             let states = copies(2, scale, [0.9, -1.3, 0.2, 0.4]);
-            let got = merge_state(
+            let got = merge_member_states(
                 &equal_weights(2),
                 &states,
                 0,
@@ -347,7 +353,7 @@ mod tests {
     #[test]
     fn a_zero_quaternion_is_the_identity() {
         let states = copies(2, [0.0, -1.0, -2.0], [0.0; 4]);
-        let got = merge_state(
+        let got = merge_member_states(
             &equal_weights(2),
             &states,
             0,
@@ -362,7 +368,7 @@ mod tests {
         // The second axis is the longest, so the canonical order would permute the axes.
         let mut states = copies(2, [-3.0, -1.0, -5.0], [-0.9, 0.2, 0.1, 0.3]);
         states.position.set_row(1, [1000.3, -7.1, 0.12]);
-        let got = merge_state(
+        let got = merge_member_states(
             &[(0, 0.3), (1, 0.7)],
             &states,
             0,
@@ -374,7 +380,7 @@ mod tests {
         let rotation = DQuat::from_xyzw(got.rotation[1], got.rotation[2], got.rotation[3], got.rotation[0]);
         assert!(rotation.dot(leader) > 0.8, "{rotation:?} for {leader:?}");
         assert!(got.log_scale[1] > got.log_scale[0] && got.log_scale[0] > got.log_scale[2]);
-        let mean = merge_state(
+        let mean = merge_member_states(
             &[(0, 0.3), (1, 0.7)],
             &states,
             0,
@@ -433,7 +439,8 @@ mod tests {
             let mut states = copies(2, [-2.0, -3.0, -5.0], [0.5, 0.5, -0.1, 0.7]);
             states.position.set_row(1, [1000.25 + offset[0], -7.125 + offset[1], 0.1 + offset[2]]);
             states.opacity_logit.plane_mut(0).copy_from_slice(&logits);
-            let got = merge_state(&equal_weights(2), &states, 0, &recipe(ProxyPosition::Mean, ProxyOpacity::Area), Attributes::all());
+            let rule = recipe(ProxyPosition::Mean, ProxyOpacity::Area);
+            let got = merge_member_states(&equal_weights(2), &states, 0, &rule, Attributes::all());
             let before: f64 = (0..2).map(|i| opacity(&states, i) * mean_area(scales(&states, i))).sum();
             let after = mean_area(DVec3::from(got.log_scale.map(f64::exp))) / (1.0 + (-got.opacity_logit).exp());
             prop_assert!((after / before - 1.0).abs() < 1e-12, "before {before}, after {after}");

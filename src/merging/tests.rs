@@ -5,7 +5,7 @@ use std::convert::Infallible;
 use glam::{DQuat, DVec3};
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
-use super::motion::{MotionThresholds, PairMotion};
+use super::motion::{MotionThresholds, PairMotionAccumulator};
 use super::*;
 use crate::model::AttributeValues;
 use crate::recipe::{MergeParams, MotionParams, Recipe};
@@ -95,7 +95,7 @@ impl MergeScene {
         let measure = |request: RequestedPairs<'_>| {
             batches.push(request.pairs().len());
             let reference = (0..states.len()).map(|i| frames[0].row(i));
-            let mut motion = PairMotion::new(request.pairs(), reference, MotionParams::Runs);
+            let mut motion = PairMotionAccumulator::new(request.pairs(), reference, MotionParams::Runs);
             frames.iter().for_each(|frame| motion.add_frame(|i| (frame.row(i), true)));
             Ok::<_, Infallible>(motion.finish().map(|pair| gate.similarity(&pair)).collect())
         };
@@ -196,8 +196,8 @@ fn moving_and_scaling_the_scene_changes_no_group() {
 fn exact_duplicates_merge_to_one() {
     let mut scene = MergeScene::uniform_cube(60);
     for column in Attributes::all().iter() {
-        for c in 0..scene.states.column(column).width() {
-            let plane = scene.states.column_mut(column).plane_mut(c);
+        for c in 0..scene.states.attribute_values(column).width() {
+            let plane = scene.states.attribute_values_mut(column).plane_mut(c);
             (0..60).for_each(|i| plane[i] = plane[i % 20]);
         }
     }
@@ -285,9 +285,9 @@ fn order_of_rows_changes_no_cluster() {
     let new_row = |row: usize| (row * 7 + 3) % n;
     for row in 0..n {
         for column in Attributes::all().iter() {
-            for c in 0..scene.states.column(column).width() {
-                shuffled.states.column_mut(column).plane_mut(c)[new_row(row)] =
-                    scene.states.column(column).plane(c)[row];
+            for c in 0..scene.states.attribute_values(column).width() {
+                shuffled.states.attribute_values_mut(column).plane_mut(c)[new_row(row)] =
+                    scene.states.attribute_values(column).plane(c)[row];
             }
         }
         shuffled.ids[new_row(row)] = scene.ids[row];

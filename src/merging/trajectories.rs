@@ -173,7 +173,8 @@ fn read_frames(
         let blocks: Vec<Vec<Gaussians>> = batch.par_chunks(GAUSSIANS_PER_BLOCK).map(read).collect::<Result<_>>()?;
         for (block, states) in batch.chunks(GAUSSIANS_PER_BLOCK).zip(&blocks) {
             for (frame, state) in states.iter().enumerate() {
-                let planes = columns.iter().flat_map(|column| state.column(column).planes().chunks_exact(block.len()));
+                let planes =
+                    columns.iter().flat_map(|column| state.attribute_values(column).planes().chunks_exact(block.len()));
                 for (c, plane) in planes.enumerate() {
                     for (&(_, place), &value) in block.iter().zip(plane) {
                         values[(place as usize * states.len() + frame) * width + c] = value;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::size::{ModelSize, bytes_below};
-use super::trajectories::{DEFAULT_OUTPUT, NO_ARCHIVE, check_output, reduced_trajectories, write_trajectories};
+use super::trajectories::{DEFAULT_OUTPUT, NO_ARCHIVE, check_output, compressed_trajectories, write_trajectories};
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result, ShowPath};
@@ -123,7 +123,7 @@ pub trait InputModel: Send + Sync {
 
     /// Returns the merge class of Gaussian `id`, such as foreground or background. Gaussians of different classes are
     /// never merged.
-    fn class(&self, id: u32) -> u8 {
+    fn merge_class(&self, id: u32) -> u8 {
         let _ = id;
         0
     }
@@ -143,7 +143,7 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Returns the kind of output that is written if neither the user nor the output path specifies one.
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         DEFAULT_OUTPUT
     }
 
@@ -164,7 +164,7 @@ pub trait InputModel: Send + Sync {
     ///
     /// # Errors
     /// Fails if frames cannot be read.
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         let _ = (clusters, reference, rule);
         Ok(Proxies::default())
     }
@@ -178,16 +178,16 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Returns the reason why SH coefficients of every degree must be kept; `None` if the SH degree may be lowered.
-    fn needs_all_bands(&self) -> Option<&'static str> {
+    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
         None
     }
 
-    /// Returns everything that an archive (`.gsz`) of the compressed model `reduction` stores.
+    /// Returns everything that an archive (`.gsz`) of the compressed model `compressed` stores.
     ///
     /// # Errors
     /// Fails if the input cannot be archived or its files cannot be read.
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        let _ = reduction;
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        let _ = compressed;
         Err(Error::usage(NO_ARCHIVE))
     }
 
@@ -219,28 +219,28 @@ pub trait InputModel: Send + Sync {
         self.has_explicit_frames()
     }
 
-    /// Returns the frames of the compressed model `reduction` as they will be read from the output.
+    /// Returns the frames of the compressed model `compressed` as they will be read from the output.
     ///
     /// # Errors
     /// Fails if the deformation field cannot be evaluated.
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(reduced_trajectories(self.source(), reduction))
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(compressed_trajectories(self.source(), compressed))
     }
 
-    /// Writes the compressed model `reduction` as the kind of output `kind` to `path`, a new file or an empty folder.
+    /// Writes the compressed model `compressed` as the kind of output `kind` to `path`, a new file or an empty folder.
     /// Returns notes for the user. Write buffers stay within the memory of `limits`. Progress is reported to `events`.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
-        write_trajectories(self.source(), reduction, kind, path, limits, events)
+        write_trajectories(self.source(), compressed, kind, path, limits, events)
     }
 }
 
@@ -265,7 +265,7 @@ pub struct MemoryProfile {
     /// Bytes of memory per Gaussian of an open reader, besides the frames that it keeps in memory.
     pub reader: u64,
     /// Bytes of memory per Gaussian of a copy of the compressed model, from which its frames are read.
-    pub reduced: u64,
+    pub compressed: u64,
     /// Bytes of memory per Gaussian of the derivative (Jacobian) of frame states with respect to stored parameters; 0
     /// if a change of a stored parameter changes the states by the same amount, so that no derivative is stored.
     pub jacobian: u64,
@@ -299,7 +299,7 @@ impl MemoryProfile {
             per_gaussian: 0,
             opening: 0,
             reader: 8,
-            reduced: 0,
+            compressed: 0,
             jacobian: 0,
             prepared: 0,
             file: 0,

@@ -168,7 +168,7 @@ impl InputModel for PlySequence {
             per_gaussian: 0,
             opening: 0,
             reader: 4,
-            reduced: 0,
+            compressed: 0,
             jacobian: 0,
             prepared: 0,
             // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
@@ -197,10 +197,10 @@ impl InputModel for PlySequence {
         }
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
         let mut content = ArchiveContent { times: [0.0, 1.0], ..ArchiveContent::default() };
-        content.cloud = gather_all(&*self.reduced(reduction)?, 0, Attributes::all())?;
-        add_cloud(&mut content, &self.frame(0)?, reduction.kept.iter().copied())?;
+        content.cloud = gather_all(&*self.compressed_frames(compressed)?, 0, Attributes::all())?;
+        add_cloud(&mut content, &self.frame(0)?, compressed.kept.iter().copied())?;
         Ok(content)
     }
 
@@ -213,7 +213,7 @@ impl InputModel for PlySequence {
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
@@ -221,25 +221,25 @@ impl InputModel for PlySequence {
     ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Ply | OutputKind::PlySequence => {
-                write_files(self, reduction, (kind, path), events).map(|()| Vec::new())
+                write_files(self, compressed, (kind, path), events).map(|()| Vec::new())
             }
-            _ => write_trajectories(self, reduction, kind, path, limits, events),
+            _ => write_trajectories(self, compressed, kind, path, limits, events),
         }
     }
 }
 
-/// Writes the frames of `reduction`, the compressed model of `sequence`, as PLY files with the properties, comments and
-/// names of the input files. `path` is the folder of these files if `kind` is [`OutputKind::PlySequence`]; otherwise it
-/// is the only file.
+/// Writes the frames of `compressed`, the compressed model of `sequence`, as PLY files with the properties, comments
+/// and names of the input files. `path` is the folder of these files if `kind` is [`OutputKind::PlySequence`];
+/// otherwise it is the only file.
 fn write_files(
     sequence: &PlySequence,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     (kind, path): (OutputKind, &Path),
     events: &Events,
 ) -> Result<()> {
-    let result = merged(sequence, reduction);
-    let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
-    let rows = rows_of_model(reduction);
+    let result = merged(sequence, compressed);
+    let places: Vec<u32> = compressed.clusters.iter().map(|cluster| cluster.output).collect();
+    let rows = rows_of_model(compressed);
     let progress = events.task("emit", "frames", sequence.paths().len() as u64);
     let write = |&frame: &usize| {
         let mut proxies = Gaussians::zeros(0, sequence.info().sh_degree);
@@ -249,8 +249,8 @@ fn write_files(
             (OutputKind::PlySequence, Some(name)) => path.join(name),
             _ => path.to_owned(),
         };
-        let change = reduction.delta_at(frame, sequence.paths().len());
-        write_like_template(&template, &rows, &proxies, &change, reduction.sh_degree, &target)?;
+        let change = compressed.delta_at(frame, sequence.paths().len());
+        write_like_template(&template, &rows, &proxies, &change, compressed.sh_degree, &target)?;
         progress.advance(1);
         Ok(())
     };

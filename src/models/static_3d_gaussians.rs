@@ -127,7 +127,7 @@ impl InputModel for StaticModel {
         Ok(Box::new(StaticModel { cloud: self.cloud.with_times(times)?, ..*self }))
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         OutputKind::Model
     }
 
@@ -138,32 +138,32 @@ impl InputModel for StaticModel {
         }
     }
 
-    fn needs_all_bands(&self) -> Option<&'static str> {
+    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
         self.root.join("cfg_args").exists().then_some("cfg_args fixes the SH degree")
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.cloud.archive_content(reduction)
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        self.cloud.archive_content(compressed)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.cloud.decode_frames(content)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        self.cloud.reduced(reduction)
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        self.cloud.compressed_frames(compressed)
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
         if kind != OutputKind::Model {
-            return self.cloud.write(reduction, kind, path, limits, events);
+            return self.cloud.write(compressed, kind, path, limits, events);
         }
         let to = self.cloud_path(path);
         let folder = to.parent().unwrap_or(path);
@@ -171,7 +171,7 @@ impl InputModel for StaticModel {
         for file in self.copied_files() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
         }
-        self.cloud.write(reduction, OutputKind::Ply, &to, limits, events)
+        self.cloud.write(compressed, OutputKind::Ply, &to, limits, events)
     }
 }
 
@@ -198,11 +198,11 @@ mod tests {
         fs::write(root.join("cfg_args"), "Namespace(sh_degree=3)").unwrap();
         let open = |path: &Path, iteration| models::open(path, &OpenOptions { iteration, ..OpenOptions::default() });
         let model = open(&root, None).unwrap();
-        assert_eq!((model.kind(), model.own_output()), ("3D Gaussian Splatting model", OutputKind::Model));
+        assert_eq!((model.kind(), model.default_output_kind()), ("3D Gaussian Splatting model", OutputKind::Model));
         let result = folder.path().join("result");
         fs::create_dir(&result).unwrap();
-        let reduction = CompressedModel::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
-        model.write(&reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
+        let compressed = CompressedModel::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
+        model.write(&compressed, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
         let [all, left] =
             [&root, &result].map(|path| gather_all(open(path, None).unwrap().source(), 0, Attributes::all()).unwrap());
         assert_eq!(left, all.pick(&[1, 3]));

@@ -203,16 +203,16 @@ impl InputModel for StillFiles {
         self.inner.notes()
     }
 
-    fn own_output(&self) -> OutputKind {
-        self.inner.own_output()
+    fn default_output_kind(&self) -> OutputKind {
+        self.inner.default_output_kind()
     }
 
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         self.inner.check_output(kind, path)
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.inner.archive_content(reduction)
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        self.inner.archive_content(compressed)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
@@ -231,19 +231,19 @@ impl InputModel for StillFiles {
         self.inner.archives_as_frames()
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        self.inner.reduced(reduction)
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        self.inner.compressed_frames(compressed)
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
-        self.inner.write(reduction, kind, path, limits, events)
+        self.inner.write(compressed, kind, path, limits, events)
     }
 }
 

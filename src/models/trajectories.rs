@@ -42,20 +42,21 @@ pub fn state_bytes(sh_degree: usize, columns: Attributes) -> u64 {
     columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
 
-/// Returns the frames of `source` after Gaussians have been removed and merged as `reduction` says, without its deltas.
-pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a CompressedModel) -> MergedSequence<'a> {
-    let members = reduction.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
-    MergedSequence::new(source, &reduction.kept, members, &reduction.merge_params)
+/// Returns the frames of `source` after Gaussians have been removed and merged as `compressed` says, without its
+/// deltas.
+pub(super) fn merged<'a>(source: &'a dyn FrameSource, compressed: &'a CompressedModel) -> MergedSequence<'a> {
+    let members = compressed.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
+    MergedSequence::new(source, &compressed.kept, members, &compressed.merge_params)
 }
 
 /// Returns the frames of the compressed model: Gaussians of `source` removed and merged, parameter deltas added and the
-/// SH degree lowered, as `reduction` says.
-pub(super) fn reduced_trajectories<'a>(
+/// SH degree lowered, as `compressed` says.
+pub(super) fn compressed_trajectories<'a>(
     source: &'a dyn FrameSource,
-    reduction: &'a CompressedModel,
+    compressed: &'a CompressedModel,
 ) -> Box<dyn FrameSource + 'a> {
-    let CompressedModel { delta, trajectory_delta, sh_degree, .. } = reduction;
-    Box::new(SourceWithDeltas::new(Box::new(merged(source, reduction)), delta, trajectory_delta, *sh_degree))
+    let CompressedModel { delta, trajectory_delta, sh_degree, .. } = compressed;
+    Box::new(SourceWithDeltas::new(Box::new(merged(source, compressed)), delta, trajectory_delta, *sh_degree))
 }
 
 /// Fails if a sequence of `frames` frames cannot be written as the kind of output `kind` to `path`. The message says
@@ -74,37 +75,37 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
     }
 }
 
-/// Writes the compressed model `reduction` of `source` as the kind of output `kind` to `path`; returns notes for the
+/// Writes the compressed model `compressed` of `source` as the kind of output `kind` to `path`; returns notes for the
 /// user. Fails if frames cannot be read or a write fails.
 pub(super) fn write_trajectories(
     source: &dyn FrameSource,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     kind: OutputKind,
     path: &Path,
     limits: &Limits,
     events: &Events,
 ) -> Result<Vec<String>> {
-    if kind == OutputKind::Gseq && !reduction.clusters.is_empty() {
-        write_merged(source, reduction, path, limits.gaussians_together, events)?;
+    if kind == OutputKind::Gseq && !compressed.clusters.is_empty() {
+        write_merged(source, compressed, path, limits.gaussians_together, events)?;
         return Ok(Vec::new());
     }
-    write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.max_kept_frames, events)
+    write_sequence(&*compressed_trajectories(source, compressed), kind, path, limits.max_kept_frames, events)
 }
 
-/// Writes the compressed model `reduction` of `source`, which has proxies (Gaussians that replace merged ones), to
+/// Writes the compressed model `compressed` of `source`, which has proxies (Gaussians that replace merged ones), to
 /// `path` as a container. Writes one block of frames after another, and each of them in ranges of output Gaussians. A
 /// range is computed from at most `max_gaussians` source Gaussians, which are kept in memory, because the members of a
 /// proxy (merged Gaussians) can be anywhere in the source. A single block of Gaussians may need more.
 fn write_merged(
     source: &dyn FrameSource,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     path: &Path,
     max_gaussians: usize,
     events: &Events,
 ) -> Result<()> {
-    let merged = merged(source, reduction);
+    let merged = merged(source, compressed);
     let SequenceInfo { count, times, sh_degree, varying } = merged.info();
-    let (compression, left) = (Compression::Zstd(ZSTD_LEVEL), reduction.sh_degree.min(*sh_degree));
+    let (compression, left) = (Compression::Zstd(ZSTD_LEVEL), compressed.sh_degree.min(*sh_degree));
     let mut writer = ContainerWriter::create(path, *count, left, FRAME_BLOCK, compression, BTreeMap::new())?;
     let progress = events.task("emit", "states", (count * times.len()) as u64);
     let parts = block_ranges(&merged, max_gaussians);
@@ -126,10 +127,10 @@ fn write_merged(
             }
             drop(frames);
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
-            let change = reduction.delta.pick(&places);
+            let change = compressed.delta.pick(&places);
             // Compressed models with proxies have no delta that varies in time.
             let no_trajectory_delta = TrajectoryDelta::default();
-            let held = SourceWithDeltas::new(Box::new(held), &change, &no_trajectory_delta, reduction.sh_degree);
+            let held = SourceWithDeltas::new(Box::new(held), &change, &no_trajectory_delta, compressed.sh_degree);
             writer.add_gaussians(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
     }

@@ -119,8 +119,8 @@ pub fn spill_blocks(
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
     for block in blocks {
-        let presence = uniform_presence(source, block == 0);
-        encode_frames(source, packing.frames_of_block(source, block), &presence, &packing, &advance, |_, _, tile| {
+        let changes = uniform_changes(source, block == 0);
+        encode_frames(source, packing.frames_of_block(source, block), &changes, &packing, &advance, |_, _, tile| {
             to.write_record(&tile.map_or(Vec::new(), EncodedTile::to_bytes))
         })?;
     }
@@ -241,30 +241,30 @@ impl ContainerWriter {
         advance: impl Fn(u64) + Sync,
     ) -> Result<()> {
         let (first, packing) = ((first / GAUSSIAN_BLOCK) as u32, self.packing);
-        let presence = uniform_presence(source, self.frame_blocks == 1);
-        encode_frames(source, frames, &presence, &packing, advance, |gaussian_block, column, tile| {
+        let changes = uniform_changes(source, self.frame_blocks == 1);
+        encode_frames(source, frames, &changes, &packing, advance, |gaussian_block, column, tile| {
             self.write_tile(first + gaussian_block, column, tile)
         })
     }
 
     /// Adds the frames `frames` of `source` as the next frame block (consecutive frames), with the time stamps `times`.
-    /// `presence[k]` states how block number k of the Gaussians changes in these frames. This saves reading and
+    /// `changes[k]` states how block number k of the Gaussians changes in these frames. This saves reading and
     /// encoding:
     /// - If the Gaussians are equal in all these frames, only the first frame is read and encoded.
     /// - If they also equal those of the frame block before, nothing is read or encoded.
-    pub fn append_with_presence(
+    pub fn append_with_changes(
         &mut self,
         source: &dyn FrameSource,
         frames: Range<usize>,
         times: &[f64],
-        presence: &[BlockChange],
+        changes: &[BlockChange],
     ) -> Result<()> {
         self.begin_block(times)?;
         let packing = self.packing;
         encode_frames(
             source,
             frames,
-            presence,
+            changes,
             &packing,
             |_| (),
             |block, column, tile| self.write_tile(block, column, tile),
@@ -311,10 +311,10 @@ pub enum BlockChange {
 /// Returns the [`BlockChange`] of every block of Gaussians of `source` for one frame block (consecutive frames), if
 /// nothing is known about how the Gaussians change. All blocks have the same value: [`BlockChange::New`] in the first
 /// frame block (`is_first`), [`BlockChange::Varying`] in all later ones.
-fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange> {
+fn uniform_changes(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange> {
     // An attribute that never varies is encoded for the first frame block only.
-    let presence = if is_first { BlockChange::New } else { BlockChange::Varying };
-    vec![presence; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
+    let changes = if is_first { BlockChange::New } else { BlockChange::Varying };
+    vec![changes; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
 }
 
 /// Returns the indices of the Gaussians in block number `block`, of `count` Gaussians in total.
@@ -323,7 +323,7 @@ pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes the frames `frames` of `source` as one frame block (consecutive frames that are stored together). `presence`
+/// Encodes the frames `frames` of `source` as one frame block (consecutive frames that are stored together). `changes`
 /// states for each block of Gaussians how it changes, and so which of its values are encoded.
 /// - Calls `each` for every tile in the order of the container, with the index of its block of Gaussians, the index of
 ///   its column, and the tile. `None` in place of the tile means that the tile equals that of the frame block before.
@@ -331,7 +331,7 @@ pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
-    presence: &[BlockChange],
+    changes: &[BlockChange],
     packing: &Packing,
     advance: impl Fn(u64) + Sync,
     mut each: impl FnMut(u32, u32, Option<&EncodedTile>) -> Result<()>,
@@ -345,7 +345,7 @@ fn encode_frames(
             .map(|&block| {
                 let gaussians = gaussian_range(info.count, block as usize);
                 let count = gaussians.len();
-                let (columns, frames) = match presence[block as usize] {
+                let (columns, frames) = match changes[block as usize] {
                     BlockChange::New => (Attributes::all(), frames.clone()),
                     BlockChange::Varying => (info.varying, frames.clone()),
                     BlockChange::Still => (Attributes::all(), frames.start..frames.start + 1),
@@ -411,7 +411,7 @@ fn encode_block(
         for (values, column) in
             values.iter_mut().zip(Attributes::all().iter()).filter(|(_, column)| want.contains(*column))
         {
-            values.extend_from_slice(state.column(column).planes());
+            values.extend_from_slice(state.attribute_values(column).planes());
         }
     }
     let encode_column = |(values, column): (&Vec<f32>, Attributes)| {

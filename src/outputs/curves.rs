@@ -45,8 +45,8 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
         info.count,
         rows.len(),
         misfit.rms(),
-        misfit.position,
-        misfit.opacity
+        misfit.max_position_error,
+        misfit.max_opacity_error
     ))
 }
 

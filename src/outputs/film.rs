@@ -238,7 +238,7 @@ impl FrameEncoder {
             std::thread::spawn(move || {
                 let mut messages = Vec::new();
                 let _ = from.by_ref().take(MAX_MESSAGE_BYTES).read_to_end(&mut messages);
-                // Reads on, because the encoder would block if nobody read its output.
+                // ReadCounts on, because the encoder would block if nobody read its output.
                 let _ = io::copy(&mut from, &mut io::sink());
                 String::from_utf8_lossy(&messages).into_owned()
             })

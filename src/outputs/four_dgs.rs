@@ -61,8 +61,8 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
          a fraction of the Gaussian's middle scale: {:.3} rms, {:.3} at most; error of opacities: {:.3} at most",
         info.count,
         misfit.rms(),
-        misfit.position,
-        misfit.opacity
+        misfit.max_position_error,
+        misfit.max_opacity_error
     ))
 }
 

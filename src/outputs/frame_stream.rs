@@ -59,7 +59,7 @@ impl<W: Write> StreamWriter<W> {
 
     fn write_columns(&mut self, columns: Attributes, state: &Gaussians) -> Result<()> {
         for column in columns.iter() {
-            let values: &AttributeValues = state.column(column);
+            let values: &AttributeValues = state.attribute_values(column);
             let (len, width) = (self.header.count, column.width(self.header.sh_degree));
             if (values.len(), values.width()) != (len, width) {
                 let (name, found) = (column.name(), (values.len(), values.width()));

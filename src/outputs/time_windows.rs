@@ -103,9 +103,9 @@ pub fn write_fitted_windows(
         lines.params.len(),
         100.0 * misfit.far_off_fraction(),
         misfit.rms(),
-        misfit.position,
+        misfit.max_position_error,
         misfit.opacity_rms(),
-        misfit.opacity
+        misfit.max_opacity_error
     )];
     if *left_out > 0 {
         notes.push(format!("{left_out} lines left out: a value of their Gaussian is not finite"));
@@ -147,7 +147,7 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
     for frame in 0..info.times.len() {
         let state = states.read(frame)?;
         let is_finite = |row: usize| {
-            let columns = Attributes::all().iter().map(|column| state.column(column));
+            let columns = Attributes::all().iter().map(|column| state.attribute_values(column));
             columns.flat_map(|values| (0..values.width()).map(|c| values.plane(c)[row])).all(f32::is_finite)
         };
         let is_seen = |row: usize| opacity(state.opacity_logit.plane(0)[row]) >= MIN_VISIBLE_OPACITY && is_finite(row);
@@ -157,9 +157,9 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
     }
     let mut gaussians = Gaussians::zeros(frame_of.len(), info.sh_degree);
     for column in Attributes::all().iter() {
-        let to = gaussians.column_mut(column);
+        let to = gaussians.attribute_values_mut(column);
         for c in 0..to.width() {
-            let values = parts.iter().flat_map(|part| part.column(column).plane(c).iter().copied());
+            let values = parts.iter().flat_map(|part| part.attribute_values(column).plane(c).iter().copied());
             to.plane_mut(c).iter_mut().zip(values).for_each(|(to, value)| *to = value);
         }
     }
@@ -306,7 +306,7 @@ mod tests {
     /// off by `position`.
     fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, FitError) {
         let mut misfit = FitError::default();
-        (0..states).for_each(|_| misfit.add(position, 0.0, 0.5));
+        (0..states).for_each(|_| misfit.add_state(position, 0.0, 0.5));
         let params = StoredParams {
             gaussians: Gaussians::zeros(lines, 0),
             format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, lines),

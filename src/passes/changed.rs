@@ -4,7 +4,7 @@
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, SequenceInfo};
-use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 
 /// Frame source that adds two changes to the Gaussians of another source: a parameter delta, which is constant in time,
 /// and a trajectory delta, which varies in time.
@@ -80,7 +80,7 @@ impl FrameSource for SourceWithDeltas<'_> {
         Some(opened.map(changed))
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.source.reads()
     }
 }
@@ -150,8 +150,9 @@ mod tests {
             let (mut expected, got) = (read(&plain), read(&changed));
             for (row, id) in ids.iter().enumerate() {
                 for column in delta.attributes().iter() {
-                    let by = delta.0.column(column);
-                    (0..by.width()).for_each(|c| expected.column_mut(column).plane_mut(c)[row] += by.plane(c)[id]);
+                    let by = delta.0.attribute_values(column);
+                    (0..by.width())
+                        .for_each(|c| expected.attribute_values_mut(column).plane_mut(c)[row] += by.plane(c)[id]);
                 }
             }
             assert!(got == expected, "{ids:?}");

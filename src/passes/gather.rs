@@ -64,9 +64,11 @@ impl<'a> BlockwiseReader<'a> {
 impl BlockReader for BlockwiseReader<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         // Free the memory of the old attributes before the new ones are read.
-        out.columns_mut(want).for_each(|column| *column = AttributeValues::default());
+        out.selected_attribute_values_mut(want).for_each(|column| *column = AttributeValues::default());
         let mut found = gather(self.source, &self.ids, frame, want)?;
-        out.columns_mut(want).zip(found.columns_mut(want)).for_each(|(old, new)| std::mem::swap(old, new));
+        out.selected_attribute_values_mut(want)
+            .zip(found.selected_attribute_values_mut(want))
+            .for_each(|(old, new)| std::mem::swap(old, new));
         Ok(())
     }
 }

@@ -79,8 +79,8 @@ impl BlockReader for HeldReader<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
             let varies = self.held.info.varying.contains(column);
-            let from = if varies { &self.held.frames[frame] } else { &self.held.constant }.column(column);
-            let to = out.column_mut(column);
+            let from = if varies { &self.held.frames[frame] } else { &self.held.constant }.attribute_values(column);
+            let to = out.attribute_values_mut(column);
             to.resize(self.len);
             for c in 0..to.width() {
                 let (plane, mut rest) = (from.plane(c), to.plane_mut(c));

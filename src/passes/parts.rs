@@ -14,7 +14,7 @@ impl<'a> BlockSlices<'a> {
     pub fn split(state: &'a mut Gaussians, want: Attributes, count: usize) -> Vec<BlockSlices<'a>> {
         let mut parts: Vec<BlockSlices<'a>> =
             (0..count.div_ceil(GAUSSIANS_PER_BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
-        for column in state.columns_mut(want) {
+        for column in state.selected_attribute_values_mut(want) {
             column.resize(count);
             for plane in column.planes_mut().chunks_exact_mut(count.max(1)) {
                 plane.chunks_mut(GAUSSIANS_PER_BLOCK).zip(&mut parts).for_each(|(part, block)| block.0.push(part));
@@ -26,7 +26,7 @@ impl<'a> BlockSlices<'a> {
     /// Copies the attributes `want` of `block`, the Gaussians of one block, into these slices. [`BlockSlices::split`]
     /// must have made the slices for the same attributes.
     pub fn write(self, block: &Gaussians, want: Attributes) {
-        let columns = want.iter().map(|column| block.column(column));
+        let columns = want.iter().map(|column| block.attribute_values(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));
         self.0.into_iter().zip(planes).for_each(|(part, plane)| part.copy_from_slice(plane));
     }

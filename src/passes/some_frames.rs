@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
-use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 
 /// Source of some frames of another source. Frame k of this source is the k-th of the chosen frames.
 pub struct SomeFrames<'a> {
@@ -40,7 +40,7 @@ impl FrameSource for SomeFrames<'_> {
         Ok(Box::new(SomeFramesReader { reader, frames: &self.frames }))
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.source.reads()
     }
 }

@@ -96,7 +96,7 @@ pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     let info = scene.source().info();
     let gaussians = request.target.map(|target| target.resolve_count(outlook.gaussians)).transpose()?;
     let output = request.output.to_string_lossy().into_owned();
-    let output_kind = run.output.as_ref().map_or(outlook.own_output, |output| output.kind);
+    let output_kind = run.output.as_ref().map_or(outlook.default_output_kind, |output| output.kind);
     Ok(DryRunReport {
         tool: TOOL.to_owned(),
         dry_run: true,

@@ -81,16 +81,25 @@ fn compress_whole(request: &Request) -> Result<Summary> {
         Ok(plan)
     };
     let (scene, plan, arrived) = open_to_measure(&request.input, plan, &mut journal)?;
-    Ok(run_stages(&scene, &plan, arrived, request, journal)?.0)
+    Ok(run_stages(&scene, &plan, arrived, request, journal)?.summary)
 }
 
-/// Compresses the open scene `scene` as `request` asks and writes the result, like [`compress`]. Returns the summary of
-/// the run and the index map: for every input Gaussian its index in the output (`None` if it was removed).
+/// Result of [`compress_scene`], besides the files that it wrote.
+#[derive(Debug)]
+pub struct CompressedScene {
+    /// Summary of the run.
+    pub summary: Summary,
+    /// Index in the output of every input Gaussian; `None` if the Gaussian was removed. Merged Gaussians have the index
+    /// of their proxy.
+    pub index_map: Vec<Option<u32>>,
+}
+
+/// Compresses the open scene `scene` as `request` asks and writes the result, like [`compress`].
 ///
 /// # Errors
 /// Fails in the cases in which [`compress`] fails. A run of only one shard (part of a divided stage) ends with
 /// [`Error::ShardDone`].
-pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
+pub fn compress_scene(scene: &Scene, request: &Request) -> Result<CompressedScene> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     plan.check_target(&scene.path)?;
     run_stages(scene, &plan, None, request, Journal::default())
@@ -131,15 +140,14 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Resu
 }
 
 /// Runs the stages of `plan`, one after the other. `arrived` holds the statistics of the Gaussians if the input is a
-/// stream and they were already computed while it arrived. Returns the summary of the run and the index map: for every
-/// input Gaussian its index in the output (`None` if it was removed).
+/// stream and they were already computed while it arrived.
 fn run_stages(
     scene: &Scene,
     plan: &RunPlan,
     arrived: Option<Measured>,
     request: &Request,
     mut journal: Journal,
-) -> Result<(Summary, Vec<Option<u32>>)> {
+) -> Result<CompressedScene> {
     plan.check(scene)?;
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.full_read()?;

@@ -37,7 +37,7 @@ use crate::scene::{
     FrameQuota, InputOptions, OpenedInput, Scene, from_input, is_linked, link_stream, load_cameras, open_scene,
     open_stream, receiving_estimate,
 };
-use crate::source::{FrameSource, Reads};
+use crate::source::{FrameSource, ReadCounts};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
@@ -66,7 +66,7 @@ pub fn open_to_measure(
         if !is_linked(stream.header(), options) {
             let (mut scene, stages, measured) = receive_measured(stream, rig, options, plan, journal)?;
             scene.add_outside_views(stages.measure.scan.recipe.outside);
-            journal.record_opening("receive", start, scene.source().info().count, Reads::default());
+            journal.record_opening("receive", start, scene.source().info().count, ReadCounts::default());
             return Ok((scene, stages, measured));
         }
         from_input(link_stream(stream, options, rig)?, options)?
@@ -135,7 +135,7 @@ fn receive_measured(
     let header = *stream.header();
     let counting = |frames| Workload::from_stream_header(&header, block, &assumed_rig, frames);
     let work = counting(0);
-    let mut stages = plan(InputMeta { gaussians: count, has_cameras, own_output: DEFAULT_OUTPUT }, &work)?;
+    let mut stages = plan(InputMeta { gaussians: count, has_cameras, default_output_kind: DEFAULT_OUTPUT }, &work)?;
     let MeasureStages { scan, visible, .. } = &stages.measure;
     let visible = visible.as_ref().filter(|visible| visible.can_render_on_arrival());
     let held = (block + PREFETCH_FRAMES) as u64;
@@ -337,9 +337,9 @@ struct AssumedTimes<'a> {
 impl<'a> AssumedTimes<'a> {
     fn new(rig: &'a Rig, split: Option<Split>) -> Self {
         let (mut timed, mut timeless) = (Vec::new(), Vec::new());
-        for (place, shot) in rig.shots.iter().enumerate() {
-            if split.is_none_or(|split| split == shot.split) {
-                match shot.time {
+        for (place, rig_view) in rig.views.iter().enumerate() {
+            if split.is_none_or(|split| split == rig_view.split) {
+                match rig_view.time {
                     Some(time) => timed.push((time, place)),
                     None => timeless.push(place),
                 }
@@ -356,6 +356,6 @@ impl<'a> AssumedTimes<'a> {
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);
         let mut places: Vec<usize> = near.map(|&(_, place)| place).chain(self.timeless.iter().copied()).collect();
         places.sort_unstable();
-        places.iter().map(|&place| (self.rig.shots[place].view, self.rig.shots[place].camera)).collect()
+        places.iter().map(|&place| (self.rig.views[place].view, self.rig.views[place].camera)).collect()
     }
 }

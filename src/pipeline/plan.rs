@@ -132,7 +132,7 @@ impl RunPlan {
         let Request { recipe, only, .. } = request;
         let target = request.target.map(|target| target.resolve_count(input.gaussians)).transpose()?;
         recipe.validate().map_err(Error::usage)?;
-        let output = checked_output(request, input.own_output)?;
+        let output = checked_output(request, input.default_output_kind)?;
         let ids = |spec: &Option<String>| spec.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, input.gaussians));
         let user =
             UserOverrides { keep: ids(&request.keep_ids)?, drop: ids(&request.drop_ids)?, keep_box: request.keep_box };
@@ -171,7 +171,7 @@ impl RunPlan {
         plan.output = Some(WriteStage::from_planning(&planning));
         plan.target = target;
         plan.stages.counts = CountPlan {
-            refinement_starts_at: planning.refine.as_ref().and_then(RefineStage::min_start_fraction),
+            refinement_starts_at: planning.refine.as_ref().and_then(RefineStage::min_start_count_fraction),
             searches: plan.search.is_some(),
         };
         (plan.merges, plan.refine, plan.fallback) = (planning.merges, planning.refine.clone(), fallback);
@@ -348,7 +348,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 
-    const INPUT: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
+    const INPUT: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, default_output_kind: OutputKind::Gseq };
 
     fn request(recipe: Recipe) -> Request {
         Request::new(InputOptions::default(), "out.gseq".into(), recipe)

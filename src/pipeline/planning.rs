@@ -15,7 +15,7 @@ pub struct InputMeta {
     /// Whether the scene has cameras of its own; `false` if the program places virtual ones.
     pub has_cameras: bool,
     /// Kind of output that is written if neither the user nor the name of the output determines one.
-    pub own_output: OutputKind,
+    pub default_output_kind: OutputKind,
 }
 
 impl InputMeta {
@@ -24,7 +24,7 @@ impl InputMeta {
         InputMeta {
             gaussians: scene.source().info().count,
             has_cameras: scene.has_cameras,
-            own_output: scene.input.own_output(),
+            default_output_kind: scene.input.default_output_kind(),
         }
     }
 }

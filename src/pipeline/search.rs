@@ -131,7 +131,7 @@ impl SearchStage {
         let frames = work.frames.min(128);
         let measured = ResourceEstimate {
             stage: NAME,
-            reads: work.scattered_full_reads(frames, limits),
+            reads: work.scattered_whole_input_reads(frames, limits),
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64)
                 + work.render_seconds(self.target_views as f64, work.gaussian_count(), RENDER_COST),
             per_gaussian: [
@@ -154,7 +154,7 @@ impl SearchStage {
         // kept after prune steps have together twice as many Gaussians as the input.
         need.per_gaussian.extend([
             ("ways", 3 * (whole + 8)),
-            ("result", work.input.reduced),
+            ("result", work.input.compressed),
             ("kept", choose::BYTES_PER_GAUSSIAN),
         ]);
         need
@@ -189,7 +189,7 @@ impl SearchStage {
                     self.name().replace('_', "-")
                 )));
             }
-            let result = scene.input.reduced(&best.result)?;
+            let result = scene.input.compressed_frames(&best.result)?;
             let held = self.value(&meter, &*result, scene, true)?;
             let summary = self.summary(&best, held, meter.held_back_names(), tried);
             drop(result);
@@ -340,7 +340,7 @@ impl SearchStage {
         (trial.journal, trial.target) = (Journal::default(), Some(size));
         trial.stages.run(Phase::Reduce, trial)?;
         let (result, journal) = (trial.take_result(), std::mem::take(&mut trial.journal));
-        let source = trial.scene.input.reduced(&result)?;
+        let source = trial.scene.input.compressed_frames(&result)?;
         let value = self.value(meter, &*source, trial.scene, false)?;
         drop(source);
         Ok(TriedSize { result, value, journal })

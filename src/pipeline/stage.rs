@@ -8,8 +8,9 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use super::CompressedScene;
 use super::request::Request;
-use super::summary::{ArchiveSummary, GoalSummary, InputSummary, MergeSummary, Summary};
+use super::summary::{ArchiveSummary, GoalSummary, InputSummary, MergeSummary};
 use crate::archive::EncodedArchive;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -355,9 +356,8 @@ pub struct RunState<'a> {
     pub archive: Option<ArchiveSummary>,
     /// Quality of the result, if it was measured.
     pub quality: Option<QualitySummary>,
-    /// Summary of the run, and the index in the output of every input Gaussian (`None` if removed). Set once the result
-    /// is written.
-    pub written: Option<(Summary, Vec<Option<u32>>)>,
+    /// Result of the run. Set once the result is written.
+    pub written: Option<CompressedScene>,
 }
 
 impl<'a> RunState<'a> {

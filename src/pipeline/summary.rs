@@ -14,8 +14,8 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::names::name_of;
 use crate::journal::records::{
-    FieldSummary, FlagSummary, Forecast, OmittedWork, PhotographSummary, QualitySummary, RefinedSummary,
-    ShDegreeSummary, StageRecord, TermSummary, number, sizes,
+    FieldSummary, Forecast, OmittedWork, PhotographSummary, QualitySummary, RefinedSummary, ShDegreeSummary,
+    StageRecord, TermSummary, UnusualValueCounts, number, sizes,
 };
 use crate::merging::PassCounts;
 use crate::models::{InputModel, ModelSize};
@@ -235,7 +235,7 @@ pub struct Summary {
     /// Percentiles of every term of the score by which Gaussians were ranked.
     pub terms: Vec<TermSummary>,
     /// Number of Gaussians with unusual values, for each kind of unusual value (such as NaN).
-    pub flags: FlagSummary,
+    pub flags: UnusualValueCounts,
     /// Numbers of Gaussians that were merged (stage 3 of the paper); `None` if nothing was merged.
     pub merge: Option<MergeSummary>,
     /// Result of the search for the smallest model with a requested quality, if a quality was requested.

@@ -139,18 +139,18 @@ pub struct PageCamera {
 pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
     let mut places: HashMap<(u32, u32), usize> = HashMap::new();
     let mut found: Vec<(PageCamera, usize)> = Vec::new();
-    for shot in &rig.shots {
-        let place = *places.entry((shot.view, shot.camera)).or_insert(found.len());
-        if let Some((look, shots)) = found.get_mut(place) {
-            *shots += 1;
+    for rig_view in &rig.views {
+        let place = *places.entry((rig_view.view, rig_view.camera)).or_insert(found.len());
+        if let Some((look, rig_views)) = found.get_mut(place) {
+            *rig_views += 1;
             look.time = None;
             continue;
         }
-        let camera = &rig.cameras[shot.camera as usize];
+        let camera = &rig.cameras[rig_view.camera as usize];
         let look = PageCamera {
-            view: shot.view,
-            split: shot.split,
-            time: shot.time,
+            view: rig_view.view,
+            split: rig_view.split,
+            time: rig_view.time,
             size: [camera.width, camera.height],
             focal: [camera.fx, camera.fy],
             principal: [camera.cx, camera.cy],

@@ -31,12 +31,12 @@ pub fn render_poster(
     background: [f32; 3],
     limits: &Limits,
 ) -> Result<Option<String>> {
-    let Some(shot) = rig.shots.first() else { return Ok(None) };
+    let Some(rig_view) = rig.views.first() else { return Ok(None) };
     let times = &source.info().times;
-    let away = |frame: &usize| shot.time.map_or(0.0, |time| (times[*frame] - time).abs());
+    let away = |frame: &usize| rig_view.time.map_or(0.0, |time| (times[*frame] - time).abs());
     let Some(frame) = (0..times.len()).min_by(|a, b| away(a).total_cmp(&away(b))) else { return Ok(None) };
-    let camera = smaller(&rig.cameras[shot.camera as usize]);
-    let frame_view = FrameView { frame, view: shot.view, camera: 0 };
+    let camera = smaller(&rig.cameras[rig_view.camera as usize]);
+    let frame_view = FrameView { frame, view: rig_view.view, camera: 0 };
     let mut uri = None;
     for_each_view_batch(
         [RenderedSource::all_gaussians(source)],
@@ -95,7 +95,7 @@ mod tests {
         let uri = render_poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().unwrap();
         let bytes = STANDARD.decode(uri.strip_prefix("data:image/jpeg;base64,").unwrap()).unwrap();
         assert_eq!(bytes[..2], [0xff, 0xd8]);
-        rig.shots.clear();
+        rig.views.clear();
         assert!(render_poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().is_none());
     }
 

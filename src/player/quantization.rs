@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use crate::error::Result;
 use crate::files::accuracy::{CodingErrors, RenderedAttributes};
-use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficients};
+use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficient_count};
 
 /// Quantization steps of the values on the player page. Each stored value differs from the original by at most half a
 /// step.
@@ -68,7 +68,7 @@ pub fn component_range(column: Attributes, sh_degree: usize) -> Range<usize> {
 
 /// Returns the number of scalar components of all attributes of a Gaussian with SH degree `sh_degree`.
 pub fn component_count(sh_degree: usize) -> usize {
-    11 + 3 * sh_coefficients(sh_degree)
+    11 + 3 * sh_coefficient_count(sh_degree)
 }
 
 /// Quantizes the attributes `which` of `state`: writes them as multiples of their quantization steps into `points`,

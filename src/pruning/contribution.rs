@@ -240,7 +240,7 @@ mod tests {
 
     impl BlockReader for Picked {
         fn read(&mut self, _: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
-            want.iter().for_each(|column| *out.column_mut(column) = self.0.column(column).clone());
+            want.iter().for_each(|column| *out.attribute_values_mut(column) = self.0.attribute_values(column).clone());
             Ok(())
         }
     }
@@ -267,7 +267,7 @@ mod tests {
         let info = SequenceInfo { count, times: vec![0.0, 1.0], sh_degree: 0, varying: Attributes::empty() };
         let rig = Rig {
             cameras: vec![Camera::look_at(glam::DVec3::new(0.0, -4.0, 0.0), glam::DVec3::ZERO, 1.0, (64, 48))],
-            shots: vec![crate::model::Shot { view: 0, camera: 0, time: None, split: Split::Train, image: None }],
+            views: vec![crate::model::RigView { view: 0, camera: 0, time: None, split: Split::Train, image: None }],
             background: None,
             origin: "test".into(),
         };

@@ -10,7 +10,7 @@ use crate::compressed_model::ReferenceFrame;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::defects::first_of;
 use crate::journal::Journal;
-use crate::journal::records::{FlagSummary, SavedCost, TermSummary};
+use crate::journal::records::{SavedCost, TermSummary, UnusualValueCounts};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPart, ResourceEstimate, Workload};
 use crate::model::RobustBox;
@@ -20,7 +20,7 @@ use crate::passes::{frames_to_cover, gather};
 use crate::pruning;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::{Overrides, Ranking, Selection, select};
-use crate::recipe::{self, NonFinite};
+use crate::recipe::{self, NonFinitePolicy};
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 use crate::statistics::score::{Scores, Term, score};
@@ -48,7 +48,7 @@ pub struct ScoreStage {
     pub snap_noise: bool,
     /// Policy for Gaussians with NaN or infinity in an attribute: the run stops with an error, drops them, or keeps
     /// them unchanged.
-    pub non_finite: NonFinite,
+    pub non_finite: NonFinitePolicy,
     /// Normalization and weights of the scores.
     pub score: recipe::ScoreParams,
     /// Parameters of the selection: fraction kept by score, and thresholds of the static and the dynamic score.
@@ -62,7 +62,7 @@ pub struct ScoreStage {
 /// that continue one another in later frames.
 const SHORT_LIFE_RATIO: usize = 4;
 
-/// Maximum fraction of Gaussians with NaN or infinity that [`NonFinite::Few`] removes.
+/// Maximum fraction of Gaussians with NaN or infinity that [`NonFinitePolicy::Few`] removes.
 const FEW_FRACTION: f64 = 0.01;
 
 /// Result of stage `score`: statistics of every Gaussian of a scene, and a selection of those to keep.
@@ -79,7 +79,7 @@ pub struct Scored {
     /// Terms of the scores: the quantities that are added, each with the percentiles by which it is normalized.
     pub terms: Vec<Term>,
     /// Number of Gaussians with unusual values, for each kind of unusual value (such as NaN).
-    pub flags: FlagSummary,
+    pub flags: UnusualValueCounts,
     /// Selected Gaussians and ranking, with the user's overrides applied.
     pub selection: Selection,
     /// Ids of protected Gaussians, which are kept, not changed and not merged; increasing.
@@ -113,7 +113,7 @@ impl ScoreStage {
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         ResourceEstimate {
             stage: NAME,
-            reads: work.full_reads(1, limits),
+            reads: work.whole_input_reads(1, limits),
             seconds: 2e-6 * work.gaussian_count(),
             per_gaussian: vec![
                 ("rows", SCORING_BYTES_PER_GAUSSIAN),
@@ -129,9 +129,9 @@ impl ScoreStage {
     pub fn non_finite_ids_to_drop(&self, rows: &StatisticRows) -> Vec<u32> {
         let ids: Vec<u32> = non_finite(rows).collect();
         let are_dropped = match self.non_finite {
-            NonFinite::Drop => true,
-            NonFinite::Few => ids.len() as f64 <= FEW_FRACTION * rows.len() as f64,
-            NonFinite::Error | NonFinite::Keep => false,
+            NonFinitePolicy::Drop => true,
+            NonFinitePolicy::Few => ids.len() as f64 <= FEW_FRACTION * rows.len() as f64,
+            NonFinitePolicy::Error | NonFinitePolicy::Keep => false,
         };
         if are_dropped { ids } else { Vec::new() }
     }
@@ -183,9 +183,9 @@ impl ScoreStage {
             let absent = self.non_finite_ids_to_drop(&rows);
             drop.extend(&absent);
             match self.non_finite {
-                NonFinite::Keep => protected.extend(non_finite(&rows)),
-                NonFinite::Error | NonFinite::Few if absent.is_empty() => refuse_non_finite(scene, &rows)?,
-                NonFinite::Error | NonFinite::Few | NonFinite::Drop => {}
+                NonFinitePolicy::Keep => protected.extend(non_finite(&rows)),
+                NonFinitePolicy::Error | NonFinitePolicy::Few if absent.is_empty() => refuse_non_finite(scene, &rows)?,
+                NonFinitePolicy::Error | NonFinitePolicy::Few | NonFinitePolicy::Drop => {}
             }
             for ids in [&mut protected, &mut drop] {
                 ids.sort_unstable();
@@ -246,9 +246,9 @@ fn refuse_non_finite(scene: &Scene, rows: &StatisticRows) -> Result<()> {
 }
 
 /// Returns the number of Gaussians with unusual values, such as NaN, for each kind of unusual value.
-fn count_flags(rows: &StatisticRows) -> FlagSummary {
+fn count_flags(rows: &StatisticRows) -> UnusualValueCounts {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
-    FlagSummary {
+    UnusualValueCounts {
         non_finite: count(AnomalyFlags::NON_FINITE),
         zero_rotation: count(AnomalyFlags::ZERO_ROTATION),
         infinite_logit: count(AnomalyFlags::INFINITE_LOGIT),

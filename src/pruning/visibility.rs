@@ -68,7 +68,7 @@ impl VisibilityStage {
         let stride = self.pixel_stride(work.pixels, work.gaussians as usize);
         let seconds = work.reading_seconds(work.gaussian_count(), frames as f64)
             + work.on_grid(stride).render_seconds(strided.min(max_views), work.gaussian_count(), CONTRIBUTION_COST);
-        ResourceEstimate { stage: NAME, reads: work.full_reads(frames, limits), seconds, per_gaussian, fixed }
+        ResourceEstimate { stage: NAME, reads: work.whole_input_reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
     /// Returns the stride n for the renders that measure the contributions of `count` Gaussians: only every n-th column

@@ -16,8 +16,8 @@ pub use effort::Effort;
 pub use parameters::{Parameter, parameters};
 pub use sections::{
     Anisotropy, AttributeGroups, Coverage, FieldParams, FieldPrecision, LengthUnit, LowScorePolicy, MergeParams,
-    MergePass, MotionParams, MotionSimilarity, NonFinite, ProxyHigherSh, ProxyOpacity, ProxyPosition, RefineParams,
-    ScanFrames, ScanParams, ScoreParams, SelectParams, ShDegreeParams, ShDegreeRule, StaticScoreTerm,
+    MergePass, MotionParams, MotionSimilarity, NonFinitePolicy, ProxyHigherSh, ProxyOpacity, ProxyPosition,
+    RefineParams, ScanFrames, ScanParams, ScoreParams, SelectParams, ShDegreeParams, ShDegreeRule, StaticScoreTerm,
 };
 
 /// Text of the preset `paper`, with a comment on every parameter.

@@ -22,7 +22,7 @@ pub struct ScanParams {
     pub view_stride: NonZeroU32,
     pub frame_stride: NonZeroU32,
     pub scoring_views: usize,
-    pub non_finite: NonFinite,
+    pub non_finite: NonFinitePolicy,
 }
 
 /// Frames that the scan reads.
@@ -68,11 +68,11 @@ pub enum Coverage {
 /// Treatment of a Gaussian that has NaN or infinity in some frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum NonFinite {
+pub enum NonFinitePolicy {
     /// Stop the run with an error that states how many Gaussians have NaN or infinity, and the ids of the first five.
     Error,
     /// Remove the Gaussians that have NaN or infinity if they are at most 1% of all; else stop the run like
-    /// [`NonFinite::Error`].
+    /// [`NonFinitePolicy::Error`].
     Few,
     /// Remove every Gaussian that has NaN or infinity in some frame.
     Drop,

@@ -59,7 +59,7 @@ impl LinearizedState {
 
     /// Returns the arrays that the scratch file stores for every frame: the attributes in `varying`, and the Jacobian.
     fn stored_columns(&mut self, varying: Attributes) -> impl Iterator<Item = &mut AttributeValues> {
-        self.state.columns_mut(varying).chain(self.jacobian.columns_mut())
+        self.state.selected_attribute_values_mut(varying).chain(self.jacobian.derivatives_mut())
     }
 }
 
@@ -181,8 +181,8 @@ impl LinearizedFrames {
             to.resize(if of.is_empty() { 0 } else { present.unwrap_or(of.len()) });
         };
         for column in Attributes::all().iter() {
-            let (of, is_constant) = (first.state.column(column), constant.contains(column));
-            let state = to.state.column_mut(column);
+            let (of, is_constant) = (first.state.attribute_values(column), constant.contains(column));
+            let state = to.state.attribute_values_mut(column);
             match &to.present {
                 Some(present) if is_constant => *state = of.pick(present),
                 None if is_constant => {
@@ -192,7 +192,7 @@ impl LinearizedFrames {
                 _ => shape(state, of),
             }
         }
-        to.jacobian.columns_mut().iter_mut().zip(first.jacobian.columns()).for_each(|(to, of)| shape(to, of));
+        to.jacobian.derivatives_mut().iter_mut().zip(first.jacobian.derivatives()).for_each(|(to, of)| shape(to, of));
         to.stored_columns(self.varying).try_for_each(|column| read(bytemuck::cast_slice_mut(column.planes_mut())))
     }
 }
@@ -208,7 +208,7 @@ mod tests {
         linearized_state.state.position.planes_mut().iter_mut().zip(0..).for_each(|(x, k)| *x = k as f32);
         linearized_state.state.opacity_logit.planes_mut().fill(-40.0);
         present.iter().for_each(|&row| linearized_state.state.opacity_logit.plane_mut(0)[row] = 1.0);
-        *linearized_state.jacobian.column_mut(Attributes::OPACITY) =
+        *linearized_state.jacobian.derivative_mut(Attributes::OPACITY) =
             AttributeValues::from_planes(1, (0..len).map(|k| k as f32).collect());
         linearized_state
     }

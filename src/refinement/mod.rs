@@ -55,7 +55,7 @@ const STEP_RENDERS: f64 = 3.0;
 pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
 /// Minimum fraction of all Gaussians with which refinement begins. Ranking alone chooses the Gaussians at the
 /// beginning; prune steps between optimization steps then remove more of them.
-const MIN_START_FRACTION: f64 = 0.4;
+const MIN_START_COUNT_FRACTION: f64 = 0.4;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_KEPT_FRACTION: f64 = 0.8;
 /// Number of views by which the Gaussians are ranked for one prune step. Each prune step takes the next views of the
@@ -178,10 +178,10 @@ impl RefineStage {
     }
 
     /// Returns the number of final optimization steps (after the last prune step) for a model that keeps the fraction
-    /// `kept` of all Gaussians: [`RefineStage::steps`] · (1 − `kept`) / (1 − [`MIN_START_FRACTION`]), at most
+    /// `kept` of all Gaussians: [`RefineStage::steps`] · (1 − `kept`) / (1 − [`MIN_START_COUNT_FRACTION`]), at most
     /// [`RefineStage::steps`], rounded up.
     fn last_steps(&self, kept: f64) -> usize {
-        let part = ((1.0 - kept) / (1.0 - MIN_START_FRACTION)).clamp(0.0, 1.0);
+        let part = ((1.0 - kept) / (1.0 - MIN_START_COUNT_FRACTION)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
     }
 
@@ -205,14 +205,14 @@ impl RefineStage {
 
     /// Returns the minimum fraction of all Gaussians with which refinement begins, before its prune steps remove the
     /// surplus; `None` if there are no prune steps.
-    pub fn min_start_fraction(&self) -> Option<f64> {
-        self.prunes.then_some(MIN_START_FRACTION)
+    pub fn min_start_count_fraction(&self) -> Option<f64> {
+        self.prunes.then_some(MIN_START_COUNT_FRACTION)
     }
 
     /// Returns the number of Gaussians with which refinement begins, given that it ends with `wanted` of the `all`
     /// Gaussians of the model. Prune steps remove the difference.
     pub fn initial_count(&self, wanted: usize, all: usize) -> usize {
-        start_count(self.min_start_fraction(), wanted, all)
+        start_count(self.min_start_count_fraction(), wanted, all)
     }
 
     /// Estimates the memory and time that this stage needs for the input `work`: frame states, the optimizer, and a
@@ -244,7 +244,7 @@ impl RefineStage {
             ("mean", 2 * work.state_bytes(self.columns)),
             ("neighbors", NEIGHBOR_BYTES),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
-            ("result", work.input.reduced),
+            ("result", work.input.compressed),
             ("views", view_bytes.max(work.input.prepared)),
         ];
         // Peak memory is the maximum of three phases: rendering the original, optimizing constant deltas of the
@@ -261,7 +261,7 @@ impl RefineStage {
         let keyframe_steps =
             (keyframe_count > 0).then(|| phase(wanted, Some(("course", keyframe_count as u64 * keyframe_bytes))));
         let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
-        let stages = [Some(original), Some(phase(wanted.max(MIN_START_FRACTION), None)), keyframe_steps];
+        let stages = [Some(original), Some(phase(wanted.max(MIN_START_COUNT_FRACTION), None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
         let (target_views, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
@@ -291,7 +291,7 @@ impl RefineStage {
         let views_of_steps = (work.threads + 4) * 12 * stored.pixels;
         ResourceEstimate {
             stage: NAME,
-            reads: 2.0 * work.scattered_full_reads(frames, limits),
+            reads: 2.0 * work.scattered_whole_input_reads(frames, limits),
             seconds: 2.0 * work.reading_seconds(work.gaussian_count(), frames as f64)
                 + stored.render_seconds(target_views, work.gaussian_count(), RENDER_COST)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),

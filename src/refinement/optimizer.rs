@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::compressed_model::ParamDelta;
-use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, sh_coefficients};
+use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, sh_coefficient_count};
 
 /// Adam's decay rates β₁, of the running mean of the derivative, and β₂, of the running mean of its square.
 const BETAS: [f32; 2] = [0.9, 0.999];
@@ -76,7 +76,7 @@ impl Adam {
     pub fn new(start: &Gaussians, columns: Attributes, sh_degree: usize, fixed: &[bool]) -> Adam {
         let mut change = Gaussians::default();
         for column in columns.iter() {
-            *change.column_mut(column) = AttributeValues::zeros(column.width(sh_degree), start.len());
+            *change.attribute_values_mut(column) = AttributeValues::zeros(column.width(sh_degree), start.len());
         }
         let extent = |i: usize| start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0;
         let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
@@ -92,14 +92,14 @@ impl Adam {
 
     /// Returns whether the delta (current parameters minus start parameters) has any value other than 0.
     pub fn has_moved(&self) -> bool {
-        self.columns.iter().any(|column| self.change.0.column(column).planes().iter().any(|&x| x != 0.0))
+        self.columns.iter().any(|column| self.change.0.attribute_values(column).planes().iter().any(|&x| x != 0.0))
     }
 
     /// Returns the delta (current parameters minus start parameters) and resets it to 0. The caller has to add the
     /// returned delta to the start parameters.
     pub fn take_delta(&mut self) -> ParamDelta {
         let moved = self.change.clone();
-        self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
+        self.change.0.selected_attribute_values_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         moved
     }
 
@@ -108,10 +108,10 @@ impl Adam {
     pub fn restart(&mut self, change: &ParamDelta) {
         self.take_delta();
         for column in (self.columns & change.attributes()).iter() {
-            self.change.0.column_mut(column).clone_from(change.0.column(column));
+            self.change.0.attribute_values_mut(column).clone_from(change.0.attribute_values(column));
         }
         for means in &mut self.means {
-            means.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
+            means.selected_attribute_values_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         }
         self.done = 0;
     }
@@ -140,12 +140,13 @@ impl Adam {
         let [position_reach, other_reach] = &self.reach;
         let count = other_reach.len().max(1);
         let [means, squares] = &mut self.means;
-        let moved = means.columns_mut(self.columns).zip(squares.columns_mut(self.columns));
-        let moved = self.columns.iter().zip(moved.zip(self.change.0.columns_mut(self.columns)));
+        let moved =
+            means.selected_attribute_values_mut(self.columns).zip(squares.selected_attribute_values_mut(self.columns));
+        let moved = self.columns.iter().zip(moved.zip(self.change.0.selected_attribute_values_mut(self.columns)));
         let mut planes = Vec::new();
         for (column, ((means, squares), values)) in moved {
             let reach = if column == Attributes::POSITION { position_reach } else { other_reach };
-            let slopes_of_column = gradients.column(column).planes().chunks_exact(count);
+            let slopes_of_column = gradients.derivatives(column).planes().chunks_exact(count);
             let state = means.planes_mut().chunks_exact_mut(count).zip(squares.planes_mut().chunks_exact_mut(count));
             let state = state.zip(values.planes_mut().chunks_exact_mut(count)).zip(slopes_of_column).enumerate();
             planes.extend(state.map(|(c, state)| (factor * rate(column, c), reach, state)));
@@ -170,7 +171,7 @@ fn rate(column: Attributes, c: usize) -> f32 {
     match column {
         Attributes::POSITION => 1.0,
         Attributes::ROTATION => 0.006,
-        Attributes::SH if c < 3 * sh_coefficients(0) => 0.015,
+        Attributes::SH if c < 3 * sh_coefficient_count(0) => 0.015,
         Attributes::SH => 0.001_25,
         // Log scale and opacity logit.
         _ => 0.05,
@@ -185,8 +186,13 @@ mod tests {
     fn slopes(state: &Gaussians, aim: f32) -> Gradients {
         let mut gradients = Gradients::new(state.len(), Attributes::all(), 0);
         for column in Attributes::all().iter() {
-            let values = state.column(column).planes();
-            gradients.column_mut(column).planes_mut().iter_mut().zip(values).for_each(|(slope, x)| *slope = x - aim);
+            let values = state.attribute_values(column).planes();
+            gradients
+                .derivatives_mut(column)
+                .planes_mut()
+                .iter_mut()
+                .zip(values)
+                .for_each(|(slope, x)| *slope = x - aim);
         }
         gradients
     }
@@ -203,8 +209,8 @@ mod tests {
         let mut end = start.clone();
         descent.delta().add_to(&mut end, Attributes::all());
         for column in Attributes::all().iter() {
-            for c in 0..end.column(column).width() {
-                let plane = end.column(column).plane(c);
+            for c in 0..end.attribute_values(column).width() {
+                let plane = end.attribute_values(column).plane(c);
                 assert_eq!(plane[1], 0.0);
                 assert!((plane[0] - 0.25).abs() < 1e-3 && plane[0] == plane[2], "{column:?} {c}: {plane:?}");
             }
@@ -220,7 +226,7 @@ mod tests {
         for k in 0..steps {
             let mut gradients = Gradients::new(1, Attributes::OPACITY, 0);
             let slope = (k as f64 * 0.7).sin() + 0.3;
-            gradients.column_mut(Attributes::OPACITY).set_row(0, [slope as f32]);
+            gradients.derivatives_mut(Attributes::OPACITY).set_row(0, [slope as f32]);
             descent.step(&gradients, 1.0, &RateSchedule::new(steps, 0.05, error));
             mean = 0.9 * mean + 0.1 * slope;
             square = 0.999 * square + 0.001 * slope * slope;
@@ -239,11 +245,18 @@ mod tests {
         for slope in [f32::MAX, 1e-38, -f32::MAX, 0.0, 3e20] {
             let mut gradients = Gradients::new(4, Attributes::all(), 0);
             for column in Attributes::all().iter() {
-                gradients.column_mut(column).planes_mut().fill(slope);
+                gradients.derivatives_mut(column).planes_mut().fill(slope);
             }
             descent.step(&gradients, 1.0, &RateSchedule::new(10, 0.05, 1.0));
         }
         let change = descent.delta();
-        assert!(Attributes::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));
+        assert!(
+            Attributes::all().iter().all(|column| change
+                .0
+                .attribute_values(column)
+                .planes()
+                .iter()
+                .all(|x| x.is_finite()))
+        );
     }
 }

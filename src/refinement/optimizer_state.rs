@@ -157,7 +157,7 @@ impl<'a> OptimizerState<'a> {
                 let state = states.read(frame)?.clone();
                 if let Some(LinearizedState { state: first, .. }) = linearized.first() {
                     for column in varying.iter() {
-                        let (first, now) = (first.column(column), state.column(column));
+                        let (first, now) = (first.attribute_values(column), state.attribute_values(column));
                         for c in 0..now.width() {
                             let values = first.plane(c).iter().zip(now.plane(c));
                             for (changing, (first, now)) in optimizer.changing.iter_mut().zip(values) {
@@ -406,7 +406,7 @@ impl<'a> OptimizerState<'a> {
         self.differentiate(k)?;
         // Attributes that do not vary with time in the input get no time-varying delta.
         for column in self.step_params.columns.iter() {
-            let slopes = self.gradients.column_mut(column);
+            let slopes = self.gradients.derivatives_mut(column);
             for c in 0..slopes.width() {
                 for (slope, changing) in slopes.plane_mut(c).iter_mut().zip(&self.changing) {
                     *slope = if changing.contains(column) { *slope } else { 0.0 };

@@ -58,10 +58,10 @@ impl RefineStage {
         need
     }
 
-    /// Fits the model `reduction` to photographs and to renders of the original. There are two kinds of target views:
+    /// Fits the model `compressed` to photographs and to renders of the original. There are two kinds of target views:
     /// photographs (`photographs`) of the views `seen` from the scene's cameras, and renders from new cameras. Some
-    /// photographs are used for validation only (see [`Targets::with_photographs`]). Returns the state of the model with
-    /// the highest PSNR on these validation photographs; this may be `reduction` itself.
+    /// photographs are used for validation only (see [`Targets::with_photographs`]). Returns the state of the model
+    /// with the highest PSNR on these validation photographs; this may be `compressed` itself.
     ///
     /// Records in `journal` the PSNR on the validation photographs before and after the fit. If the fit did not raise
     /// it, records the reason instead.
@@ -73,15 +73,15 @@ impl RefineStage {
         scene: &Scene,
         scored: &Scored,
         (seen, photographs): (Vec<FrameView>, &Photographs),
-        reduction: CompressedModel,
+        compressed: CompressedModel,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let count = reduction.len();
+        let count = compressed.len();
         if self.last_steps(count as f64 / scored.gaussian_count().max(1) as f64) == 0 {
             journal.leave_out(FIT, "no Gaussians were removed");
-            return Ok(reduction);
+            return Ok(compressed);
         }
-        let key = (self.key(), &reduction, &seen, photographs.file_stamps(&seen)?, &scored.protected);
+        let key = (self.key(), &compressed, &seen, photographs.file_stamps(&seen)?, &scored.protected);
         let key = scene.work.key(&key);
         journal.run_cached_stage(NAME, count, scene, key, |journal| {
             let stride = self.stride(scene.workload().pixels, count);
@@ -90,7 +90,8 @@ impl RefineStage {
             let held_back = parts.validation.len();
             // The notes of a refinement are about renders of the original, so they are not taken over.
             let mut own = Journal::default();
-            let result = RefineRun::new(NAME, self, scene, scored, &targets, parts).refine_best(reduction, &mut own)?;
+            let result =
+                RefineRun::new(NAME, self, scene, scored, &targets, parts).refine_best(compressed, &mut own)?;
             match own.refined {
                 Some(found) => {
                     let (before, result) = (found.before, found.result);

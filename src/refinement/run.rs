@@ -45,7 +45,7 @@ const AVERAGED_FRACTION: f64 = 0.4;
 const AVERAGE_EVERY: usize = 4;
 
 impl RefineStage {
-    /// Prunes the model `reduction` in prune steps to `wanted` Gaussians and refines it. Returns the model with the
+    /// Prunes the model `compressed` in prune steps to `wanted` Gaussians and refines it. Returns the model with the
     /// parameters that have the best quality on the validation views. Protected Gaussians (which the user keeps) are
     /// not changed. `scored`: ranking and protected Gaussians. `journal` gets notes for the user, and the reason if
     /// nothing was done.
@@ -56,34 +56,34 @@ impl RefineStage {
         &self,
         scene: &Scene,
         scored: &Scored,
-        reduction: CompressedModel,
+        compressed: CompressedModel,
         wanted: usize,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let count = reduction.len();
+        let count = compressed.len();
         let steps = self.last_steps(wanted as f64 / scored.gaussian_count().max(1) as f64);
         if count == 0 || scene.schedule.pair_count() == 0 {
             journal.leave_out("refinement", "there are no Gaussians or no views");
-            return Ok(reduction);
+            return Ok(compressed);
         }
         if steps == 0 {
             journal.leave_out("refinement", "no Gaussians were removed");
-            return Ok(reduction);
+            return Ok(compressed);
         }
-        let key = scene.work.key(&(self.key(), &reduction, wanted, steps, &scored.protected));
+        let key = scene.work.key(&(self.key(), &compressed, wanted, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, count, scene.source(), |journal| {
                 let targets =
                     Targets::new(scene, self.target_views, self.stored_stride(scene.workload().pixels, count), false)?;
                 scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.split());
-                Ok((run.run_all(&reduction, wanted, steps, journal)?.0, wanted))
+                Ok((run.run_all(&compressed, wanted, steps, journal)?.0, wanted))
             })
         };
         journal.cached(&scene.work, NAME, key, run)
     }
 
-    /// Refines the model `reduction` to `wanted` Gaussians like [`RefineStage::run`], as part of the stage named
+    /// Refines the model `compressed` to `wanted` Gaussians like [`RefineStage::run`], as part of the stage named
     /// `stage`, with the target views `targets`. Returns only the mean PSNR, dB, of the refined model against the
     /// original on the validation views.
     ///
@@ -95,13 +95,13 @@ impl RefineStage {
         scene: &Scene,
         scored: &Scored,
         targets: &Targets,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         wanted: usize,
     ) -> Result<f64> {
         let steps = self.last_steps(wanted as f64 / scored.gaussian_count().max(1) as f64);
         let mut run = RefineRun::new(stage, self, scene, scored, targets, targets.split());
-        let key = run.key(reduction, wanted, wanted).extended_by(&steps);
-        let all = || Ok(run.run_all(reduction, wanted, steps, &mut Journal::default())?.1);
+        let key = run.key(compressed, wanted, wanted).extended_by(&steps);
+        let all = || Ok(run.run_all(compressed, wanted, steps, &mut Journal::default())?.1);
         scene.work.get_or_compute(&format!("{stage}-size"), key, all)
     }
 }
@@ -248,47 +248,47 @@ impl<'a> RefineRun<'a> {
         self.progress.restart(steps as u64);
     }
 
-    /// Creates the optimizer for the model `reduction`. `result`: reader of the frames of this model.
+    /// Creates the optimizer for the model `compressed`. `result`: reader of the frames of this model.
     fn start_optimizer<'b>(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         result: &'b dyn FrameSource,
     ) -> Result<OptimizerState<'b>>
     where
         'a: 'b,
     {
-        let fixed = reduction.kept.iter().map(|id| self.scored.is_protected(*id)).collect();
+        let fixed = compressed.kept.iter().map(|id| self.scored.is_protected(*id)).collect();
         OptimizerState::new(self.scene, result, self.targets, self.refine.step_params(), fixed)
     }
 
-    /// Returns the cache key of a refined model that is made from `reduction`. `size`: number of Gaussians of this
+    /// Returns the cache key of a refined model that is made from `compressed`. `size`: number of Gaussians of this
     /// model, which later prune steps may reduce further. `wanted`: number of Gaussians after the last of these prune
     /// steps, at most `size`. The number of optimization steps depends on `wanted`, so it is part of the key.
-    fn key(&self, reduction: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
-        self.key.extended_by(&(reduction, size, wanted, self.sampler.taken))
+    fn key(&self, compressed: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
+        self.key.extended_by(&(compressed, size, wanted, self.sampler.taken))
     }
 
     fn timer(&self, key: CacheKey) -> CheckpointTimer {
         CheckpointTimer { key, phase: 0, saved_at: Instant::now(), interval: CHECKPOINT_INTERVAL[0] }
     }
 
-    /// Prunes `reduction` to `wanted` Gaussians in prune steps and then runs `steps` final optimization steps. Returns
+    /// Prunes `compressed` to `wanted` Gaussians in prune steps and then runs `steps` final optimization steps. Returns
     /// the refined model, and the mean PSNR in dB of its renders of the validation views, compared with the original.
     fn run_all(
         &mut self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         wanted: usize,
         steps: usize,
         journal: &mut Journal,
     ) -> Result<(CompressedModel, f64)> {
-        let mut timer = self.timer(self.key(reduction, wanted, wanted).extended_by(&steps));
-        let result = self.scene.input.reduced(reduction)?;
-        let mut optimizer = self.start_optimizer(reduction, &*result)?;
-        let prune_counts = prune_counts(reduction.len(), wanted);
+        let mut timer = self.timer(self.key(compressed, wanted, wanted).extended_by(&steps));
+        let result = self.scene.input.compressed_frames(compressed)?;
+        let mut optimizer = self.start_optimizer(compressed, &*result)?;
+        let prune_counts = prune_counts(compressed.len(), wanted);
         let prune_steps_total: usize =
             prune_counts.windows(2).map(|pair| self.refine.steps_before(pair[0], wanted)).sum();
         self.set_total_steps(prune_steps_total + steps + self.steps_along_time(steps));
-        let mut left = reduction.clone();
+        let mut left = compressed.clone();
         for pair in prune_counts.windows(2) {
             let steps = self.refine.steps_before(pair[0], wanted);
             left = left.pick(&self.prune_step(&mut optimizer, &mut timer, steps, pair[1])?);
@@ -298,22 +298,22 @@ impl<'a> RefineRun<'a> {
         Ok((left, best.psnr))
     }
 
-    /// Makes one prune step: runs optimization steps, then removes all but `size` Gaussians of `reduction`. Returns the
-    /// pruned model. `wanted`: number of Gaussians that remain after the last prune step.
+    /// Makes one prune step: runs optimization steps, then removes all but `size` Gaussians of `compressed`. Returns
+    /// the pruned model. `wanted`: number of Gaussians that remain after the last prune step.
     pub(crate) fn prune_to(
         &mut self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         size: usize,
         wanted: usize,
     ) -> Result<CompressedModel> {
-        let key = self.key(reduction, size, wanted);
+        let key = self.key(compressed, size, wanted);
         let (left, taken) = self.scene.work.get_or_compute(&format!("{}-cut", self.stage), key, || {
             let mut timer = self.timer(key);
-            let result = self.scene.input.reduced(reduction)?;
-            let mut optimizer = self.start_optimizer(reduction, &*result)?;
-            let steps = self.refine.steps_before(reduction.len(), wanted);
+            let result = self.scene.input.compressed_frames(compressed)?;
+            let mut optimizer = self.start_optimizer(compressed, &*result)?;
+            let steps = self.refine.steps_before(compressed.len(), wanted);
             self.set_total_steps(steps);
-            let mut left = reduction.pick(&self.prune_step(&mut optimizer, &mut timer, steps, size)?);
+            let mut left = compressed.pick(&self.prune_step(&mut optimizer, &mut timer, steps, size)?);
             left.delta = left.delta.plus(optimizer.change());
             Ok((left, self.sampler.taken))
         })?;
@@ -321,27 +321,27 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs the final optimization steps on the model `reduction`. Returns this model with the parameter deltas (values
-    /// that refinement adds) that have given the best validation quality.
+    /// Runs the final optimization steps on the model `compressed`. Returns this model with the parameter deltas
+    /// (values that refinement adds) that have given the best validation quality.
     pub(crate) fn refine_best(
         &mut self,
-        mut reduction: CompressedModel,
+        mut compressed: CompressedModel,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let steps = self.refine.last_steps(reduction.len() as f64 / self.scored.gaussian_count().max(1) as f64);
-        let (key, work) = (self.key(&reduction, reduction.len(), reduction.len()), &self.scene.work);
+        let steps = self.refine.last_steps(compressed.len() as f64 / self.scored.gaussian_count().max(1) as f64);
+        let (key, work) = (self.key(&compressed, compressed.len(), compressed.len()), &self.scene.work);
         let (change, course, taken) = journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
             self.set_total_steps(steps + self.steps_along_time(steps));
             let mut timer = self.timer(key);
-            let result = self.scene.input.reduced(&reduction)?;
-            let mut optimizer = self.start_optimizer(&reduction, &*result)?;
+            let result = self.scene.input.compressed_frames(&compressed)?;
+            let mut optimizer = self.start_optimizer(&compressed, &*result)?;
             let BestState { delta, trajectory, .. } = self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
             Ok((delta, trajectory, self.sampler.taken))
         })?;
         self.sampler.skip_to(taken);
-        (reduction.delta, reduction.trajectory_delta) =
-            (reduction.delta.plus(change), reduction.trajectory_delta.plus(course));
-        Ok(reduction)
+        (compressed.delta, compressed.trajectory_delta) =
+            (compressed.delta.plus(change), compressed.trajectory_delta.plus(course));
+        Ok(compressed)
     }
 
     /// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame); 0 if the

@@ -32,17 +32,17 @@ use crate::source::{BlockReader, FrameSource, Ids};
 fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (CompressedModel, Journal) {
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
-    let reduction = CompressedModel::pruned(scored.ranking().best_ids(count), &recipe.merge);
+    let compressed = CompressedModel::pruned(scored.ranking().best_ids(count), &recipe.merge);
     let mut journal = Journal::default();
     let refine = RefineStage { steps, ..RefineStage::from_recipe(&recipe, None, false).unwrap() };
-    (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
+    (refine.run(scene, &scored, compressed, count, &mut journal).unwrap(), journal)
 }
 
-/// Returns the mean PSNR in dB of renders of `reduction` over the test views of `rig`, compared with renders of the
+/// Returns the mean PSNR in dB of renders of `compressed` over the test views of `rig`, compared with renders of the
 /// original.
-fn test_psnr(scene: &Scene, rig: &Rig, reduction: &CompressedModel) -> f64 {
+fn test_psnr(scene: &Scene, rig: &Rig, compressed: &CompressedModel) -> f64 {
     let schedule = rig.schedule(&scene.source().info().times, Some(Split::Test)).unwrap();
-    let result = scene.input.reduced(reduction).unwrap();
+    let result = scene.input.compressed_frames(compressed).unwrap();
     let frame_psnr = |(frame, views): (usize, &[(u32, u32)])| -> f64 {
         let [original, now] =
             [scene.source(), &*result].map(|source| gather_all(source, frame, Attributes::all()).unwrap());
@@ -62,7 +62,7 @@ fn refinement_improves_test_views() {
     let rig = scene.rig.clone();
     let (plain, _) = refined(&scene, 300, 0, Vec::new());
     let (moved, journal) = refined(&scene, 300, 200, Vec::new());
-    let [before, after] = [&plain, &moved].map(|reduction| test_psnr(&scene, &rig, reduction));
+    let [before, after] = [&plain, &moved].map(|compressed| test_psnr(&scene, &rig, compressed));
     assert!(after > before + 3.0, "{before:.2} dB before, {after:.2} after");
     assert_eq!((journal.left_out.len(), journal.notes.len()), (0, 1));
     assert_eq!(moved.kept, plain.kept);
@@ -84,7 +84,7 @@ fn threads_and_limits_do_not_change_the_result() {
     assert!(on(2, &scene).delta == one.delta, "limits change it");
     for (place, id) in one.kept.iter().enumerate().filter(|(_, id)| keep.contains(id)) {
         let moved = |column: Attributes| {
-            let delta = one.delta.0.column(column);
+            let delta = one.delta.0.attribute_values(column);
             (0..delta.width()).any(|c| delta.plane(c)[place] != 0.0)
         };
         assert!(!Attributes::all().iter().any(moved), "Gaussian {id} is protected and moved");
@@ -117,14 +117,14 @@ fn interrupted_runs_resume_to_the_same_result() {
             let recipe = Recipe::preset("default").unwrap();
             let scored = crate::pipeline::score_scene(scene, &recipe, &UserOverrides::default())?;
             let count = scored.gaussian_count();
-            let reduction = CompressedModel::pruned(scored.ranking().best_ids(2 * count / 5), &recipe.merge);
+            let compressed = CompressedModel::pruned(scored.ranking().best_ids(2 * count / 5), &recipe.merge);
             let few = RefineStage {
                 steps,
                 steps_per_prune: 40,
                 target_views,
                 ..RefineStage::from_recipe(&recipe, None, true).unwrap()
             };
-            few.run(scene, &scored, reduction, count / 4, &mut Journal::default())
+            few.run(scene, &scored, compressed, count / 4, &mut Journal::default())
         };
         let start = Instant::now();
         let expected = run(&open(None)).unwrap();
@@ -144,8 +144,8 @@ fn interrupted_runs_resume_to_the_same_result() {
             });
             std::fs::rename(&away, &place).unwrap();
             match ended {
-                Ok(reduction) => {
-                    found = Some(reduction);
+                Ok(compressed) => {
+                    found = Some(compressed);
                     break;
                 }
                 Err(error) => {
@@ -203,10 +203,10 @@ fn leaving_out_absent_gaussians_changes_no_result() {
         let scene = Scene::new(path, input, rig, Some(Split::Train)).unwrap();
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-        let reduction = CompressedModel::pruned(scored.ranking().best_ids(600), &recipe.merge);
+        let compressed = CompressedModel::pruned(scored.ranking().best_ids(600), &recipe.merge);
         let few =
             RefineStage { steps: 100, steps_per_prune: 40, ..RefineStage::from_recipe(&recipe, None, true).unwrap() };
-        few.run(&scene, &scored, reduction, 250, &mut Journal::default()).unwrap()
+        few.run(&scene, &scored, compressed, 250, &mut Journal::default()).unwrap()
     });
     assert!(!away.delta.is_empty() && away.delta == unseen.delta);
     assert_eq!(away.kept, unseen.kept);
@@ -233,7 +233,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         let given = read(scene.source());
         let is_still = |states: &[Gaussians], column: Attributes, row: usize| {
-            let values = |frame: &Gaussians| frame.column(column).pick(&[row as u32]);
+            let values = |frame: &Gaussians| frame.attribute_values(column).pick(&[row as u32]);
             states.iter().all(|frame| values(frame) == values(&states[0]))
         };
         // Of the Gaussians that are visible in all frames, keeps half of the moving and an eighth of the static ones.
@@ -244,22 +244,22 @@ fn explicit_frames_improve_along_time_in_every_output() {
         };
         let kept: Vec<u32> = (0..given[0].len() as u32).filter(part).collect();
         let [constant, varying] = [0, 4].map(|keyframe_count| {
-            let reduction = CompressedModel::pruned(kept.clone(), &recipe.merge);
+            let compressed = CompressedModel::pruned(kept.clone(), &recipe.merge);
             let few = RefineStage {
                 steps: 300,
                 keyframes: keyframe_count,
                 ..RefineStage::from_recipe(&recipe, None, false).unwrap()
             };
-            few.run(&scene, &scored, reduction, kept.len(), &mut Journal::default()).unwrap()
+            few.run(&scene, &scored, compressed, kept.len(), &mut Journal::default()).unwrap()
         });
         assert_eq!((constant.trajectory_delta.0.len(), varying.trajectory_delta.0.len()), (0, 4));
         assert!(varying.delta == constant.delta, "{name}");
         // Some tracks (Gaussians linked over frames) join two Gaussians of this scene that have different colors.
         assert!(link == LinkMode::Apart || !varying.trajectory_delta.attributes().contains(Attributes::SH), "{name}");
-        let [before, after] = [&constant, &varying].map(|reduction| test_psnr(&scene, &demo.rig(), reduction));
+        let [before, after] = [&constant, &varying].map(|compressed| test_psnr(&scene, &demo.rig(), compressed));
         // Moving Gaussians cover a small part of these views, so the gain is small; static Gaussians must stay static.
         assert!(after > before + 0.02, "{name}: {before:.2} dB constant in time, {after:.2} varying in time");
-        let expected = read(&*scene.input.reduced(&varying).unwrap());
+        let expected = read(&*scene.input.compressed_frames(&varying).unwrap());
         // Attributes that are constant in the input stay constant, for every Gaussian.
         let mut still = [0, 0];
         for (place, &id) in varying.kept.iter().enumerate() {
@@ -289,11 +289,11 @@ fn fixed_higher_sh_degrees_stay_unchanged() {
     let scene = scene(folder.path());
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-    let reduction = CompressedModel::pruned(scored.ranking().best_ids(300), &recipe.merge);
-    let (mut journal, count) = (Journal::default(), reduction.len());
+    let compressed = CompressedModel::pruned(scored.ranking().best_ids(300), &recipe.merge);
+    let (mut journal, count) = (Journal::default(), compressed.len());
     let refine =
         RefineStage { steps: 100, ..RefineStage::from_recipe(&recipe, None, false).unwrap() }.with_fixed_higher_sh();
-    let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();
+    let moved = refine.run(&scene, &scored, compressed, count, &mut journal).unwrap();
     assert_eq!((moved.delta.0.sh.width(), moved.delta.0.sh.len()), (3, count));
     assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");
 }
@@ -319,10 +319,10 @@ fn the_optimizer_restarts_and_continues_with_a_subset() {
         let targets = Targets::new(&scene, 520, NonZeroU32::MIN, false).unwrap();
         let count = scene.source().info().count;
         let kept = (0..count as u32).step_by(2).collect();
-        let reduction = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
-        let result = scene.input.reduced(&reduction).unwrap();
+        let compressed = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
+        let result = scene.input.compressed_frames(&compressed).unwrap();
         let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, false).unwrap();
-        let fixed = vec![false; reduction.len()];
+        let fixed = vec![false; compressed.len()];
         let mut optimizer = OptimizerState::new(&scene, &*result, &targets, refine.step_params(), fixed).unwrap();
         let (views, schedule) = ([0, 7, 20], RateSchedule::new(20, 1.0, 1.0));
         let start = optimizer.quality(&views).unwrap().psnr;
@@ -342,12 +342,12 @@ fn the_optimizer_restarts_and_continues_with_a_subset() {
         let back = optimizer.quality(&views).unwrap().psnr;
         assert!((back - there).abs() < 1e-3, "{there:.4} dB there, {back:.4} after the restart");
 
-        let some: Vec<u32> = (0..reduction.len() as u32).step_by(3).collect();
+        let some: Vec<u32> = (0..compressed.len() as u32).step_by(3).collect();
         let whole = optimizer.change();
         optimizer.pick(&some).unwrap();
         let picked = optimizer.quality(&views).unwrap().psnr;
-        let picked_model = CompressedModel { delta: whole.pick(&some), ..reduction.pick(&some) };
-        let result = scene.input.reduced(&picked_model).unwrap();
+        let picked_model = CompressedModel { delta: whole.pick(&some), ..compressed.pick(&some) };
+        let result = scene.input.compressed_frames(&picked_model).unwrap();
         let fixed = vec![false; some.len()];
         let fresh = OptimizerState::new(&scene, &*result, &targets, refine.step_params(), fixed).unwrap();
         let expected = fresh.quality(&views).unwrap().psnr;

@@ -1,9 +1,9 @@
 //! Animations of the page: one or two views over time, rendered from the original and from the compressed model, with
 //! the difference.
 //!
-//! Input: the chosen renders, and both models. Output: JPEG files as data URIs. A page has at most [`VIEWS`] animations
-//! of at most [`FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their difference: about 3 MB
-//! per result.
+//! Input: the chosen renders, and both models. Output: JPEG files as data URIs. A page has at most [`MAX_VIEWS`]
+//! animations of at most [`MAX_FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their
+//! difference: about 3 MB per result.
 
 use std::io;
 
@@ -23,9 +23,9 @@ use crate::scene::view_selection::select_frames;
 
 /// Maximum number of animated views: the view of the worst render, and the view of the median render if it is another
 /// one.
-pub const VIEWS: usize = 2;
+pub const MAX_VIEWS: usize = 2;
 /// Maximum number of frames of an animation, evenly spaced from first to last.
-pub const FRAMES: usize = 24;
+pub const MAX_FRAMES: usize = 24;
 /// Maximum number of pixels of an image in an animation; larger renders are scaled down.
 pub const MAX_PIXELS: u64 = 90_000;
 /// Maximum number of pixels of a difference image in an animation. It is lower than [`MAX_PIXELS`], because noise in
@@ -70,11 +70,11 @@ pub const IMAGE_NAMES: [&str; 3] = ["original", "compressed", "difference"];
 /// Returns the estimated bytes of memory of the animations: 1 byte per pixel of their images, and 1 byte per pixel in
 /// the page that contains them.
 pub fn memory_bytes(work: &Workload) -> u64 {
-    let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
+    let images = 3 * MAX_VIEWS as u64 * work.frames.min(MAX_FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)
 }
 
-/// Renders the animations of at most [`VIEWS`] views: the views of the worst and of the median render in `shown`.
+/// Renders the animations of at most [`MAX_VIEWS`] views: the views of the worst and of the median render in `shown`.
 /// Returns no animation for a scene of one frame.
 ///
 /// # Errors
@@ -86,11 +86,11 @@ pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
         let FrameView { view, camera, .. } = side.view(choice.place);
         let wanted = k == 0 || choice.why.iter().any(|why| why == MEDIAN);
-        if every < 2 || !wanted || cameras.contains(&camera) || films.len() == VIEWS {
+        if every < 2 || !wanted || cameras.contains(&camera) || films.len() == MAX_VIEWS {
             continue;
         }
         cameras.push(camera);
-        let views = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), FRAMES);
+        let views = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), MAX_FRAMES);
         let made = side.render_pairs(&views, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
             let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));

@@ -73,7 +73,8 @@ pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
         ("held", work.kept_frames_bytes(&Limits::NONE, Attributes::SH | Attributes::OPACITY)),
     ];
     let frames = MAX_SAMPLED_FRAMES.min(work.frames as usize) as u64;
-    let reads = work.scattered_full_reads(1, &Limits::NONE) + 2.0 * work.scattered_full_reads(frames, &Limits::NONE);
+    let reads = work.scattered_whole_input_reads(1, &Limits::NONE)
+        + 2.0 * work.scattered_whole_input_reads(frames, &Limits::NONE);
     let seconds = 2e-5 * work.gaussian_count() + work.reading_seconds(work.gaussian_count(), 2.0 * frames as f64);
     ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.block_buffer_memory()] }
 }
@@ -276,7 +277,7 @@ mod tests {
             for (row, &id) in self.0.iter().enumerate() {
                 (self.1)(id, frame, &mut all, row);
             }
-            want.iter().for_each(|column| *out.column_mut(column) = all.column(column).clone());
+            want.iter().for_each(|column| *out.attribute_values_mut(column) = all.attribute_values(column).clone());
             Ok(())
         }
     }

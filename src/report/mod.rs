@@ -52,7 +52,7 @@ use crate::outputs::kind::check_folder_name;
 use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::stages::measure::MeasureStages;
 use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored, UserOverrides};
-use crate::recipe::{NonFinite, Recipe};
+use crate::recipe::{NonFinitePolicy, Recipe};
 use crate::scene::Scene;
 pub use findings::{CompressedModelData, ReportData};
 
@@ -245,7 +245,7 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
         Some(recipe) => recipe.clone(),
         None => Recipe::preset("default")?,
     };
-    recipe.scan.non_finite = NonFinite::Keep;
+    recipe.scan.non_finite = NonFinitePolicy::Keep;
     Ok(recipe)
 }
 

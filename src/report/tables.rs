@@ -65,7 +65,7 @@ pub(super) fn stages(stages: &[StageRecord]) -> String {
 mod tests {
     use super::*;
     use crate::report::failure::{Verdict, WorstPlace};
-    use crate::source::Reads;
+    use crate::source::ReadCounts;
 
     #[test]
     fn failure_modes_are_these_bytes() {
@@ -111,7 +111,7 @@ mod tests {
             name: "scan".to_owned(),
             gaussians_in: 10,
             gaussians_out: 7,
-            reads: Reads::default(),
+            reads: ReadCounts::default(),
             full_reads: 0.0,
             scratch_bytes: 0,
             from_cache: false,

@@ -76,7 +76,7 @@ fn clear_row(state: &mut Gaussians, want: Attributes, row: usize) {
             Attributes::OPACITY => f32::NEG_INFINITY,
             _ => 0.0,
         };
-        let values = state.column_mut(column);
+        let values = state.attribute_values_mut(column);
         (0..values.width()).for_each(|plane| values.plane_mut(plane)[row] = value);
         if column == Attributes::ROTATION {
             values.plane_mut(0)[row] = 1.0;

@@ -4,7 +4,7 @@
 use super::Scene;
 use crate::error::Result;
 use crate::model::SequenceInfo;
-use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
+use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadCounts, ReadPlan};
 
 impl Scene {
     /// Makes the Gaussians with the ids `ids` (in increasing order) invisible in all later reads of the scene's frames.
@@ -44,12 +44,12 @@ impl FrameSource for Scene {
         self.input.source().decoder()
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.input.source().reads()
     }
 
-    fn ahead(&self) -> Option<&dyn Prefetch> {
-        self.input.source().ahead()
+    fn prefetcher(&self) -> Option<&dyn Prefetch> {
+        self.input.source().prefetcher()
     }
 }
 

@@ -22,7 +22,7 @@ use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Throughput, Workl
 use crate::model::{Rig, Split, ViewSchedule};
 use crate::models::InputModel;
 use crate::progress::Events;
-use crate::source::Reads;
+use crate::source::ReadCounts;
 
 use absent::Absent;
 pub use compressed::open_compressed;
@@ -132,7 +132,7 @@ impl Scene {
     /// tiles (separately compressed parts of a container) in memory if the plan says so.
     pub fn apply_plan(&mut self, plan: &MemoryPlan) {
         self.limits = plan.limits;
-        self.planned_reads = Some(plan.full_reads());
+        self.planned_reads = Some(plan.whole_input_reads());
         if plan.limits.keeps_tiles {
             self.input.hold_decoded();
         }
@@ -143,10 +143,10 @@ impl Scene {
     ///
     /// # Errors
     /// Fails if a file of the input does not exist any more.
-    pub fn full_read(&self) -> Result<Reads> {
+    pub fn full_read(&self) -> Result<ReadCounts> {
         let info = self.source().info();
         let states = info.count as u64 * info.times.len() as u64;
         let bytes = if self.input.memory_profile().frame_block > 0 { self.input.stored_bytes()? } else { 0 };
-        Ok(Reads { bytes, tiles: 0, states })
+        Ok(ReadCounts { bytes, tiles: 0, states })
     }
 }

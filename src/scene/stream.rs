@@ -107,7 +107,7 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
 pub fn frame_quota(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
     let block = frames_per_tile(header);
     let held = (block + PREFETCH_FRAMES) as u64;
-    let no_cameras = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
+    let no_cameras = Rig { cameras: Vec::new(), views: Vec::new(), background: None, origin: String::new() };
     let work = |frames| Workload::from_stream_header(header, block, &no_cameras, frames);
     let receive =
         |frames| move |work: &Workload, limits: &Limits| vec![receiving_estimate(work, limits, held, None, frames)];

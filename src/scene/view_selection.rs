@@ -54,7 +54,7 @@ pub(crate) fn distinct_views(rig: &Rig, views: impl Iterator<Item = FrameView>) 
 
 /// Returns the error that the chosen split has no views. It names the splits of `rig` that have some.
 pub fn no_view_error(rig: &Rig) -> Error {
-    let has = |split: &Split| rig.shots.iter().any(|shot| shot.split == *split);
+    let has = |split: &Split| rig.views.iter().any(|rig_view| rig_view.split == *split);
     let named = [(Split::Train, "train"), (Split::Val, "val"), (Split::Test, "test")];
     let available: Vec<&str> = named.iter().filter(|(split, _)| has(split)).map(|(_, name)| *name).collect();
     Error::usage(format!(
@@ -186,15 +186,15 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::model::{Camera, Shot};
+    use crate::model::{Camera, RigView};
 
-    /// Returns a rig with the views `shots`. Each is a tuple of view number, camera index, time and split.
-    fn rig(shots: &[(u32, u32, Option<f64>, Split)]) -> Rig {
+    /// Returns a rig with the views `rig_views`. Each is a tuple of view number, camera index, time and split.
+    fn rig(rig_views: &[(u32, u32, Option<f64>, Split)]) -> Rig {
         let camera = |k: u32| Camera::look_at(DVec3::new(f64::from(k), -5.0, 1.0), DVec3::ZERO, 1.0, (8, 8));
-        let shot = |&(view, camera, time, split)| Shot { view, camera, time, split, image: None };
+        let rig_view = |&(view, camera, time, split)| RigView { view, camera, time, split, image: None };
         Rig {
             cameras: (0..4).map(camera).collect(),
-            shots: shots.iter().map(shot).collect(),
+            views: rig_views.iter().map(rig_view).collect(),
             background: None,
             origin: "test.json".into(),
         }

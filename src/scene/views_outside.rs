@@ -185,7 +185,7 @@ pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec
 
 /// Returns the cameras of `rig` that took training views.
 pub fn training_cameras(rig: &Rig) -> Vec<Camera> {
-    let training = rig.shots.iter().filter(|shot| shot.split == Split::Train).map(|shot| shot.camera);
+    let training = rig.views.iter().filter(|rig_view| rig_view.split == Split::Train).map(|rig_view| rig_view.camera);
     let training: BTreeSet<u32> = training.collect();
     training.into_iter().map(|camera| rig.cameras[camera as usize].clone()).collect()
 }

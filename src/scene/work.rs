@@ -47,8 +47,13 @@ impl Scene {
 
     /// Returns the cache key that stands for the cameras, their views at each frame, and the background.
     fn key(&self) -> CacheKey {
-        let shots: Vec<_> = self.rig.shots.iter().map(|shot| (shot.view, shot.camera, shot.time, shot.split)).collect();
-        CacheKey::new(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
+        let rig_views: Vec<_> = self
+            .rig
+            .views
+            .iter()
+            .map(|rig_view| (rig_view.view, rig_view.camera, rig_view.time, rig_view.split))
+            .collect();
+        CacheKey::new(&(&self.rig.cameras, rig_views, &self.schedule, self.background, self.has_cameras))
     }
 }
 

@@ -261,7 +261,7 @@ mod tests {
         let mut frame = Gaussians::zeros(77, 0);
         for (column, t) in [(Attributes::POSITION, t), (Attributes::OPACITY, opacity_frame), (Attributes::ROTATION, 0)]
         {
-            for (i, x) in frame.column_mut(column).planes_mut().iter_mut().enumerate() {
+            for (i, x) in frame.attribute_values_mut(column).planes_mut().iter_mut().enumerate() {
                 // About half of the opacities are below 1/255.
                 *x = 10.0 * random(1000 * t + i) - if column == Attributes::OPACITY { 10.5 } else { 7.0 };
             }
@@ -310,7 +310,7 @@ mod tests {
                 for t in 0..times.len() {
                     let mut frame = Gaussians::zeros(LEN, 0);
                     for column in NEEDED_ATTRIBUTES.iter() {
-                        for (i, x) in frame.column_mut(column).planes_mut().iter_mut().enumerate() {
+                        for (i, x) in frame.attribute_values_mut(column).planes_mut().iter_mut().enumerate() {
                             *x = 10.0 * random(1000 * t + i) - 7.0;
                         }
                     }

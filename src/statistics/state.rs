@@ -48,7 +48,7 @@ impl BlockState {
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Attributes) {
         for column in changed.iter() {
-            let values = gaussians.column(column);
+            let values = gaussians.attribute_values(column);
             let largest = largest_magnitude(values.planes());
             if !largest.is_finite() {
                 self.flag_non_finite(values);

@@ -252,7 +252,7 @@ fn non_finite_values_clear_only_their_own_row() {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let mut frames = clean.clone();
             let (t, i) = (k, 37 * k + 5);
-            frames[t].column_mut(column).plane_mut(0)[i] = bad;
+            frames[t].attribute_values_mut(column).plane_mut(0)[i] = bad;
             let got = scan(&frames, &schedule, &recipe).rows;
             assert!(got.flags[i].contains(AnomalyFlags::NON_FINITE), "{} = {bad} is flagged", column.name());
             let zeros = [got.d[i], got.kappa[i], got.v[i], got.c[i], got.vis[i], f64::from(got.life[i])];
@@ -468,8 +468,10 @@ proptest! {
 fn slice(from: &Gaussians, range: std::ops::Range<usize>) -> Gaussians {
     let mut out = Gaussians::zeros(range.len(), 0);
     for column in Attributes::all().iter() {
-        for c in 0..from.column(column).width() {
-            out.column_mut(column).plane_mut(c).copy_from_slice(&from.column(column).plane(c)[range.clone()]);
+        for c in 0..from.attribute_values(column).width() {
+            out.attribute_values_mut(column)
+                .plane_mut(c)
+                .copy_from_slice(&from.attribute_values(column).plane(c)[range.clone()]);
         }
     }
     out

@@ -58,7 +58,7 @@ impl BlockReader for Block {
                 Attributes::OPACITY => (1.0, 3.0, 1e-3),
                 _ => (0.3, 1.0, 1e-3),
             };
-            let to = out.column_mut(column);
+            let to = out.attribute_values_mut(column);
             to.resize(self.0.len());
             for c in 0..to.width() {
                 for (x, &id) in to.plane_mut(c).iter_mut().zip(&self.0) {

@@ -48,7 +48,7 @@ fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Containe
 fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
     let state = state(scene, frame);
     for column in Attributes::all().iter() {
-        let values = state.column(column);
+        let values = state.attribute_values(column);
         let bytes: Vec<u8> = (0..values.len())
             .flat_map(|i| (0..values.width()).flat_map(move |c| values.plane(c)[i].to_le_bytes()))
             .collect();
@@ -279,7 +279,7 @@ fn generated_stream_always_moves_and_is_reproducible() {
         let (one, two) = (state(&found, frame), state(&found, other));
         assert!(one == state(&again, frame), "frame {frame}");
         for column in info.varying.iter() {
-            let values = one.column(column).planes().iter().zip(two.column(column).planes());
+            let values = one.attribute_values(column).planes().iter().zip(two.attribute_values(column).planes());
             let (all, equal) = values.fold((0, 0), |(all, equal), (a, b)| (all + 1, equal + usize::from(a == b)));
             // Noise of 2e-5 gives the same float of size 4 in 1% of cases.
             assert!(equal * 50 < all, "{}: {equal} of {all} values of frames {frame} and {other}", column.name());

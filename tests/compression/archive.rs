@@ -133,7 +133,7 @@ fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
         let [before, after] = [&before, &after].map(|input| state(input.source(), frame));
         for column in Attributes::all().iter() {
             let bound = archive["bounds"][column.name()].as_f64().unwrap();
-            let off = before.column(column).planes().iter().zip(after.column(column).planes());
+            let off = before.attribute_values(column).planes().iter().zip(after.attribute_values(column).planes());
             let off = off.map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).fold(0.0, f64::max);
             assert!(bound > 0.0 && off <= bound, "{} is {off} off, not {bound}", column.name());
         }
@@ -167,7 +167,7 @@ fn single_ply_returns_with_its_header_and_close_values() {
     let workplace = Workplace::new();
     let mut gaussians = Gaussians::zeros(400, 1);
     let mut seed = 1u64;
-    for column in gaussians.columns_mut(splatsieve::model::Attributes::all()) {
+    for column in gaussians.selected_attribute_values_mut(splatsieve::model::Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|value| {
             seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
             *value = (seed >> 40) as f32 / (1 << 24) as f32 - 0.5;

@@ -19,7 +19,7 @@ fn largest_difference(workplace: &Workplace, column: Attributes) -> (f64, bool) 
     let (mut largest_difference, mut kept) = (0.0f64, true);
     for frame in 0..exact.info().times.len() {
         let [exact, within] = [&exact, &within].map(|source| state(source, frame));
-        for (a, b) in exact.column(column).planes().iter().zip(within.column(column).planes()) {
+        for (a, b) in exact.attribute_values(column).planes().iter().zip(within.attribute_values(column).planes()) {
             match a.is_finite() {
                 true => largest_difference = largest_difference.max((f64::from(*a) - f64::from(*b)).abs()),
                 false => kept &= a.to_bits() == b.to_bits(),

@@ -29,7 +29,7 @@ fn compress_by_three(input: &dyn InputModel) -> CompressedModel {
         compressed.clusters.push(Cluster { output, leader, members: vec![(leader, 0.625), (leader + 1, 0.375)] });
     }
     let reference = ReferenceFrame { frame: 0, extent: 1.0 };
-    compressed.proxies = input.solve(&compressed.clusters, reference, &rule).unwrap();
+    compressed.proxies = input.compute_proxies(&compressed.clusters, reference, &rule).unwrap();
     compressed
 }
 
@@ -37,9 +37,9 @@ fn compress_by_three(input: &dyn InputModel) -> CompressedModel {
 fn delta_of_every_third(count: usize, columns: Attributes) -> ParamDelta {
     let mut delta = Gaussians::default();
     for column in columns.iter() {
-        *delta.column_mut(column) = Gaussians::zeros(count, 0).column(column).clone();
-        for c in 0..delta.column(column).width() {
-            let plane = delta.column_mut(column).plane_mut(c);
+        *delta.attribute_values_mut(column) = Gaussians::zeros(count, 0).attribute_values(column).clone();
+        for c in 0..delta.attribute_values(column).width() {
+            let plane = delta.attribute_values_mut(column).plane_mut(c);
             (0..count).step_by(3).for_each(|i| plane[i] = 0.01 * (c + 1) as f32 * (i as f32 - 7.0));
         }
     }
@@ -60,7 +60,7 @@ fn states_before_and_after_writing(
     }
     input.write(compressed, kind, &path, &Limits::NONE, &Events::IGNORED).unwrap();
     let frames = input.source().info().times.len();
-    let reduced = input.reduced(compressed).unwrap();
+    let reduced = input.compressed_frames(compressed).unwrap();
     let written = open(&path);
     let found = [&*reduced, written.source()].map(|source| (0..frames).map(|frame| state(source, frame)).collect());
     if kind.is_folder() {
@@ -105,7 +105,7 @@ fn compressed_states_equal_written_states_after_any_delta() {
                 assert!(reduced == written, "a field in half precision differs from what was promised");
                 compressed.field = FieldPrecision::Exact;
             }
-            if input.needs_all_bands().is_none() {
+            if input.reason_to_keep_sh_degree().is_none() {
                 for sh_degree in 0..input.source().info().sh_degree {
                     compressed.sh_degree = sh_degree;
                     let [reduced, written] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);

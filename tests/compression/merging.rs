@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use crate::scene::{PlyRows, Workplace, by_formula, lasting_files, state, tiny};
 use glam::{DMat3, DQuat, DVec3};
 use splatsieve::limits::Limits;
-use splatsieve::merging::proxy::{ProxyState, merge_state};
+use splatsieve::merging::proxy::{ProxyState, merge_member_states};
 use splatsieve::model::{Attributes, Gaussians, SH_C0};
-use splatsieve::pipeline::{PruneOrMerge, Request, Target, compress_scene, score_scene};
+use splatsieve::pipeline::{CompressedScene, PruneOrMerge, Request, Target, compress_scene, score_scene};
 use splatsieve::pruning::score::{Scored, UserOverrides};
 use splatsieve::recipe::{
     MergeParams, MergePass, MotionParams, MotionSimilarity, ProxyHigherSh, ProxyOpacity, ProxyPosition, Recipe,
@@ -140,8 +140,14 @@ fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Re
             all_frames.frames[all_frames.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
         for (node, group) in groups.iter().enumerate().filter(|(_, group)| group.len() > 1) {
             let members = weighted(scored, group);
-            merge_state(&members, &all_frames.frames[all_frames.reference], group[0] as u32, merge, Attributes::all())
-                .write(Attributes::all(), node, &mut nodes);
+            merge_member_states(
+                &members,
+                &all_frames.frames[all_frames.reference],
+                group[0] as u32,
+                merge,
+                Attributes::all(),
+            )
+            .write(Attributes::all(), node, &mut nodes);
         }
         let rows = scored.rows().unwrap();
         let size = |node: usize| groups[node].iter().map(|&id| rows.c[id]).sum::<f64>();
@@ -203,7 +209,7 @@ fn assert_merges_as_specified(recipe: &Recipe, only: PruneOrMerge) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");
     let scene = crate::scene::scene(&tiny());
-    let (summary, map) = compress_scene(&scene, &options(&output, recipe, only)).unwrap();
+    let CompressedScene { summary, index_map: map } = compress_scene(&scene, &options(&output, recipe, only)).unwrap();
     let scored = score_scene(&scene, recipe, &UserOverrides::default()).unwrap();
     let all_frames = AllFrames::read(&scene);
     assert_eq!(summary.merge.unwrap().reference_frame, all_frames.reference);
@@ -308,7 +314,7 @@ fn assert_solved_at_leaders(
     for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
         let leader = group[0];
         let members = weighted(scored, group);
-        let merged = merge_state(&members, at_reference, leader as u32, merge, Attributes::all());
+        let merged = merge_member_states(&members, at_reference, leader as u32, merge, Attributes::all());
         assert_is_mixture(&merged, &members, at_reference, leader, merge);
         let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
         // (property, merged state, state of the leader, state of the proxy in the result)
@@ -435,7 +441,7 @@ fn merged(workplace: &Workplace, scene: &Scene, recipe: &Recipe) -> (Vec<Option<
     let (input, output) =
         (InputOptions { path: workplace.path("frames"), ..InputOptions::default() }, workplace.path("out"));
     let request = Request { only: PruneOrMerge::Merge, ..Request::new(input, output, recipe.clone()) };
-    let (summary, map) = compress_scene(scene, &request).unwrap();
+    let CompressedScene { summary, index_map: map } = compress_scene(scene, &request).unwrap();
     (map, summary.merge.unwrap().proxies)
 }
 
@@ -498,7 +504,7 @@ fn proxies_that_drift_from_members_return_to_leaders() {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");
     let scene = crate::scene::scene(&tiny());
-    let (_, map) = compress_scene(&scene, &options(&output, &recipe, PruneOrMerge::Merge)).unwrap();
+    let map = compress_scene(&scene, &options(&output, &recipe, PruneOrMerge::Merge)).unwrap().index_map;
     let (scored, all_frames) =
         (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), AllFrames::read(&scene));
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
@@ -540,7 +546,7 @@ fn number_of_pair_partitions_changes_no_byte() {
             scene.limits = Limits { pairs_together, max_kept_frames: 3, ..Limits::NONE };
             scene.scratch = scratch.path().to_owned();
             let options = Request { target, ..options(&output, &recipe, PruneOrMerge::Both) };
-            let (summary, map) = compress_scene(&scene, &options).unwrap();
+            let CompressedScene { summary, index_map: map } = compress_scene(&scene, &options).unwrap();
             assert_eq!(std::fs::read_dir(scratch.path()).unwrap().count(), 0, "scratch files are left");
             (lasting_files(&output), map, summary.merge.unwrap().passes)
         };

@@ -100,7 +100,7 @@ fn dynamic_3d_gaussians_states_match_their_trainer() {
     }
     // The cameras of this trainer's own files equal those of the transforms files.
     let train = |scene: &Scene| -> Vec<_> {
-        scene.rig.shots.iter().filter(|shot| shot.split == Split::Train).cloned().collect()
+        scene.rig.views.iter().filter(|rig_view| rig_view.split == Split::Train).cloned().collect()
     };
     let [of_own, of_other] = [train(&own), train(&other)];
     assert_eq!(of_own.len(), of_other.len());

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use splatsieve::files::container::Container;
-use splatsieve::model::{Attributes, Camera, Gaussians, Rig, Shot, Split, StatisticRows};
+use splatsieve::model::{Attributes, Camera, Gaussians, Rig, RigView, Split, StatisticRows};
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::FramesInMemory;
 use splatsieve::pipeline::score_scene;
@@ -48,11 +48,16 @@ impl GeneratedScene {
         let mut held = FramesInMemory::new(self.frames[0].len(), 0, Attributes::all(), Gaussians::zeros(0, 0));
         self.times.iter().zip(&self.frames).for_each(|(&time, frame)| held.push(time, frame.clone()));
         write_container(&held, &path, gseq::Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
-        let shot =
-            |view: usize| Shot { view: view as u32, camera: view as u32, time: None, split: Split::Train, image: None };
+        let rig_view = |view: usize| RigView {
+            view: view as u32,
+            camera: view as u32,
+            time: None,
+            split: Split::Train,
+            image: None,
+        };
         let rig = Rig {
             cameras: self.cameras.clone(),
-            shots: (0..self.cameras.len()).map(shot).collect(),
+            views: (0..self.cameras.len()).map(rig_view).collect(),
             background: None,
             origin: "made up".to_owned(),
         };

@@ -46,8 +46,9 @@ fn pixels(page: &mut Browser) -> (u32, u32, Vec<u8>) {
 fn decibels(page: &mut Browser, scene: &Scene, show: &str, view: u32, frame: usize) -> f64 {
     go(page, &format!("show={show}&camera={view}&frame={frame}&paused&exact"));
     let (width, height, found) = pixels(page);
-    let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
-    let expected = render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
+    let rig_view = scene.rig.views.iter().find(|rig_view| rig_view.view == view).unwrap();
+    let expected =
+        render(&state(scene.source(), frame), &scene.rig.cameras[rig_view.camera as usize], scene.background);
     assert!(expected.data.iter().any(|x| (x - expected.data[0]).abs() > 0.2), "an empty render tells nothing");
     psnr(&browser::image_from_bytes(width, height, &found), &expected)
 }
@@ -339,9 +340,9 @@ fn trained_models_look_as_in_the_rasterizer() {
         for (view, shown, frame) in [(0, 0, 0), (1, 2, 39), (8, 3, 59)] {
             go(&mut page, &format!("camera={view}&frame={shown}&paused&exact&x={name}"));
             let (width, height, found) = pixels(&mut page);
-            let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
+            let rig_view = scene.rig.views.iter().find(|rig_view| rig_view.view == view).unwrap();
             let expected =
-                render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
+                render(&state(scene.source(), frame), &scene.rig.cameras[rig_view.camera as usize], scene.background);
             let decibels = psnr(&browser::image_from_bytes(width, height, &found), &expected);
             eprintln!("{name}, view {view}, frame {frame}: {decibels:.1} dB");
             assert!(decibels >= LEAST_DB, "{name}, view {view}, frame {frame}: {decibels} dB");

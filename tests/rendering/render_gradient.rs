@@ -61,14 +61,14 @@ fn gradients_match_central_differences_of_the_oracle() {
             (0..target.len()).map(|at| 0.5 * sure[at / 3] * square(at)).sum()
         };
         for column in Attributes::all().iter() {
-            let got = found.column(column).planes();
+            let got = found.derivatives(column).planes();
             let mut largest: Vec<usize> = (0..got.len()).collect();
             largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
             for &at in largest.iter().take(60) {
                 let mut changed = gaussians.clone();
-                let (both, apart) = step_both_ways(gaussians.column(column).planes()[at], 3e-5);
+                let (both, apart) = step_both_ways(gaussians.attribute_values(column).planes()[at], 3e-5);
                 let losses = both.map(|x| {
-                    changed.column_mut(column).planes_mut()[at] = x;
+                    changed.attribute_values_mut(column).planes_mut()[at] = x;
                     loss(&changed)
                 });
                 let expected = (losses[1] - losses[0]) / apart;
@@ -118,7 +118,7 @@ fn gradient_of_one_gaussian_is_its_closed_form() {
             let error = (f64::from(got) - expected).abs();
             assert!(error <= tolerance, "channel {channel}, {what}: got {got}, expected {expected} ± {tolerance}");
         };
-        let row = |column| found.column(column);
+        let row = |column| found.derivatives(column);
         close("logit", row(Attributes::OPACITY).plane(0)[0], (1.0 - opacity) * contrast * alphas);
         // Blue is clamped at 0.
         let color = if channel == 2 { 0.0 } else { splatsieve::model::SH_C0 * alphas };
@@ -152,7 +152,7 @@ fn image_moves_by_focal_length_over_depth() {
     let above = |red: f32| (f64::from(red) - 1.0 / 255.0).max(0.0);
     let red: f64 = image.data.chunks_exact(3).map(|pixel| above(pixel[0])).sum();
     let expected = red * (1.0 - 0.1) * 50.0 / 2.0;
-    let got = f64::from(found.column(Attributes::POSITION).plane(0)[0]);
+    let got = f64::from(found.derivatives(Attributes::POSITION).plane(0)[0]);
     // The sum over whole pixels is the integral, except for pixels on the edge.
     assert!((got / expected - 1.0).abs() < 0.005, "got {got}, expected {expected}");
 }
@@ -184,11 +184,15 @@ fn gradients_ignore_threads_buffers_frozen_attributes() {
         {
             let got = with(&mut kept, columns, 0);
             for column in columns.iter() {
-                let planes = got.column(column).planes();
-                assert!(planes == &expected.column(column).planes()[..planes.len()], "{columns:?}: {}", column.name());
+                let planes = got.derivatives(column).planes();
+                assert!(
+                    planes == &expected.derivatives(column).planes()[..planes.len()],
+                    "{columns:?}: {}",
+                    column.name()
+                );
                 assert!(planes.iter().any(|&x| x != 0.0));
             }
-            assert!(Attributes::all().difference(columns).iter().all(|column| got.column(column).is_empty()));
+            assert!(Attributes::all().difference(columns).iter().all(|column| got.derivatives(column).is_empty()));
         }
     }
 }
@@ -203,11 +207,11 @@ fn gradients_of_several_renders_add_up() {
     }
     let apart = views.each_ref().map(|camera| gradients(&scene, camera, Image::clone));
     for column in Attributes::all().iter() {
-        let [first, second] = [0, 1].map(|k: usize| apart[k].column(column).planes());
+        let [first, second] = [0, 1].map(|k: usize| apart[k].derivatives(column).planes());
         let sums = first.iter().zip(second).map(|(a, b)| a + b);
         // A position gets two contributions from each render.
         let close = |(&got, expected): (&f32, f32)| (got - expected).abs() <= 1e-6 * (1.0 + expected.abs());
-        assert!(both.column(column).planes().iter().zip(sums).all(close), "{}", column.name());
+        assert!(both.derivatives(column).planes().iter().zip(sums).all(close), "{}", column.name());
     }
     both.clear();
     assert!(both == Gradients::new(200, Attributes::all(), 1));
@@ -242,13 +246,13 @@ fn extremes_give_finite_gradients_and_undrawn_ones_zero() {
         extreme(&mut scene);
         let found = gradients(&scene, &camera, Image::clone);
         for column in Attributes::all().iter() {
-            let planes = found.column(column).planes();
+            let planes = found.derivatives(column).planes();
             assert!(planes.iter().all(|x| x.is_finite()), "extreme {k}, {}: not finite", column.name());
             // The last three extremes and the one that is too faint are not drawn.
-            let is_zero = (0..found.column(column).width()).all(|c| found.column(column).plane(c)[0] == 0.0);
+            let is_zero = (0..found.derivatives(column).width()).all(|c| found.derivatives(column).plane(c)[0] == 0.0);
             assert!(is_zero || (k < 13 && k != 5), "extreme {k}, {}: {planes:?}", column.name());
         }
-        assert!(found.column(Attributes::SH).planes().iter().any(|&x| x != 0.0), "extreme {k}: nothing is left");
+        assert!(found.derivatives(Attributes::SH).planes().iter().any(|&x| x != 0.0), "extreme {k}: nothing is left");
     }
 }
 
@@ -259,9 +263,9 @@ fn gradient_of_an_image_filling_gaussian_is_its_alpha() {
     let camera = plain_camera(40);
     let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0, 0.0, 0.0]));
     let expected = 0.6 * 0.4 * (1.0 - 0.1) * 1600.0;
-    let got = found.column(Attributes::OPACITY).plane(0)[0];
+    let got = found.derivatives(Attributes::OPACITY).plane(0)[0];
     assert!((got / expected - 1.0).abs() < 1e-5, "logit: got {got}, expected {expected}");
-    assert!(found.column(Attributes::LOG_SCALE).planes().iter().all(|x| x.abs() < 1e-3), "it has no edge");
+    assert!(found.derivatives(Attributes::LOG_SCALE).planes().iter().all(|x| x.abs() < 1e-3), "it has no edge");
 }
 
 #[test]
@@ -271,9 +275,9 @@ fn clamped_alpha_has_gradients_only_for_color() {
     let camera = plain_camera(40);
     let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0; 3]));
     for column in Attributes::all().difference(Attributes::SH).iter() {
-        assert!(found.column(column).planes().iter().all(|&x| x == 0.0), "{} moves", column.name());
+        assert!(found.derivatives(column).planes().iter().all(|&x| x == 0.0), "{} moves", column.name());
     }
-    let got = f64::from(found.column(Attributes::SH).plane(0)[0]);
+    let got = f64::from(found.derivatives(Attributes::SH).plane(0)[0]);
     let expected = splatsieve::model::SH_C0 * 0.99 * 1600.0;
     assert!((got / expected - 1.0).abs() < 1e-5, "color: got {got}, expected {expected}");
 }
@@ -331,7 +335,7 @@ fn stored_positions_get_gradients_through_the_field() {
         let square = |at: usize| (pixels[at / 3][at % 3] - f64::from(target[at])).powi(2);
         (0..target.len()).map(|at| 0.5 * sure[at / 3] * square(at)).sum()
     };
-    let got = found.column(Attributes::POSITION).planes();
+    let got = found.derivatives(Attributes::POSITION).planes();
     let mut largest: Vec<usize> = (0..got.len()).collect();
     largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
     let (mut off, mut through_field) = (0, 0);
@@ -345,7 +349,7 @@ fn stored_positions_get_gradients_through_the_field() {
         let expected = (losses[1] - losses[0]) / apart;
         // States are f32, and some steps cross the edge of a texel or a ReLU.
         off += usize::from((f64::from(got[at]) - expected).abs() > 0.01 * expected.abs());
-        let alone = direct.column(Attributes::POSITION).planes()[at];
+        let alone = direct.derivatives(Attributes::POSITION).planes()[at];
         through_field += usize::from((alone - got[at]).abs() > 0.03 * got[at].abs());
     }
     assert!(off <= 3, "{off} of 60 derivatives are off");

@@ -112,8 +112,12 @@ pub(crate) fn state(source: &dyn FrameSource, frame: usize) -> Gaussians {
 
 /// Returns the bits of all values of Gaussian `i`, attribute by attribute.
 pub(crate) fn bits(state: &Gaussians, i: usize) -> Vec<u32> {
-    let planes = |column: Attributes| (0..state.column(column).width()).map(move |c| (column, c));
-    Attributes::all().iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
+    let planes = |column: Attributes| (0..state.attribute_values(column).width()).map(move |c| (column, c));
+    Attributes::all()
+        .iter()
+        .flat_map(planes)
+        .map(|(column, c)| state.attribute_values(column).plane(c)[i].to_bits())
+        .collect()
 }
 
 /// Temporary folder in which a test runs the program and writes files.

@@ -59,7 +59,7 @@ pub enum Error {
     #[error(
         "selfcheck failed: {0}\n  do not trust results of this program on this machine, and report the table above"
     )]
-    Unsound(String),
+    SelfCheckFailed(String),
     /// A `gseq` container (the file format for sequences of Gaussians) is malformed, or cannot be read or written.
     #[error(transparent)]
     Container(#[from] gseq::Error),
@@ -198,9 +198,10 @@ impl Error {
             Error::Io { action, .. } | Error::Container(gseq::Error::Io { action, .. }) => {
                 ErrorKind::from_action(action)
             }
-            Error::ShardDone(_) | Error::Internal(_) | Error::Unsound(_) | Error::Container(gseq::Error::Usage(_)) => {
-                ErrorKind::Internal
-            }
+            Error::ShardDone(_)
+            | Error::Internal(_)
+            | Error::SelfCheckFailed(_)
+            | Error::Container(gseq::Error::Usage(_)) => ErrorKind::Internal,
         }
     }
 }
@@ -222,7 +223,7 @@ mod tests {
             (io("create a folder in"), ErrorKind::Output, 1),
             (io("write"), ErrorKind::Output, 1),
             (Error::internal("frame 7 of 5"), ErrorKind::Internal, 1),
-            (Error::Unsound("motion far away".to_owned()), ErrorKind::Internal, 1),
+            (Error::SelfCheckFailed("motion far away".to_owned()), ErrorKind::Internal, 1),
         ] {
             assert_eq!((error.kind(), error.kind().exit_code()), (kind, code), "{error}");
         }

@@ -3,7 +3,7 @@
 use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
 
-use super::sh_coefficients;
+use super::sh_coefficient_count;
 
 /// Values of one attribute (such as the position) of `len` Gaussians, stored as `width` planes. Plane `c` holds
 /// component `c` of every Gaussian, so that the inner loops of projection and statistics read memory contiguously.
@@ -122,7 +122,7 @@ impl Gaussians {
             rotation: AttributeValues::zeros(4, len),
             log_scale: AttributeValues::zeros(3, len),
             opacity_logit: AttributeValues::zeros(1, len),
-            sh: AttributeValues::zeros(3 * sh_coefficients(sh_degree), len),
+            sh: AttributeValues::zeros(3 * sh_coefficient_count(sh_degree), len),
         }
     }
 
@@ -143,13 +143,13 @@ impl Gaussians {
 
     /// Drops the SH coefficients above degree `sh_degree`.
     pub fn truncate_sh(&mut self, sh_degree: usize) {
-        self.sh.narrow(3 * sh_coefficients(sh_degree.min(self.sh_degree())));
+        self.sh.narrow(3 * sh_coefficient_count(sh_degree.min(self.sh_degree())));
     }
 
     /// Changes the number of Gaussians to `len`. All values are unspecified until they are written.
     pub fn resize(&mut self, len: usize) {
-        for column in Attributes::all().iter() {
-            self.column_mut(column).resize(len);
+        for attribute in Attributes::all().iter() {
+            self.attribute_values_mut(attribute).resize(len);
         }
     }
 
@@ -170,8 +170,8 @@ impl Gaussians {
     /// # Panics
     /// Panics if `self` ends before the last Gaussian of `block` is copied.
     pub fn write_rows(&mut self, first: usize, block: &Gaussians) {
-        for column in Attributes::all().iter() {
-            let (from, to) = (block.column(column), self.column_mut(column));
+        for attribute in Attributes::all().iter() {
+            let (from, to) = (block.attribute_values(attribute), self.attribute_values_mut(attribute));
             for c in 0..to.width() {
                 to.plane_mut(c)[first..][..from.len()].copy_from_slice(from.plane(c));
             }
@@ -182,7 +182,7 @@ impl Gaussians {
     ///
     /// # Panics
     /// Panics if `which` is not exactly one attribute.
-    pub fn column(&self, which: Attributes) -> &AttributeValues {
+    pub fn attribute_values(&self, which: Attributes) -> &AttributeValues {
         match which {
             Attributes::POSITION => &self.position,
             Attributes::ROTATION => &self.rotation,
@@ -194,7 +194,7 @@ impl Gaussians {
     }
 
     /// Returns the values of the attributes `which` for writing, in the order of [`Attributes::all`].
-    pub fn columns_mut(&mut self, which: Attributes) -> impl Iterator<Item = &mut AttributeValues> {
+    pub fn selected_attribute_values_mut(&mut self, which: Attributes) -> impl Iterator<Item = &mut AttributeValues> {
         let Gaussians { position, rotation, log_scale, opacity_logit, sh } = self;
         let all = [position, rotation, log_scale, opacity_logit, sh];
         Attributes::all().iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
@@ -204,7 +204,7 @@ impl Gaussians {
     ///
     /// # Panics
     /// Panics if `which` is not exactly one attribute.
-    pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
+    pub fn attribute_values_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         match which {
             Attributes::POSITION => &mut self.position,
             Attributes::ROTATION => &mut self.rotation,
@@ -240,7 +240,7 @@ impl Attributes {
         let components = |column: Attributes| match column {
             Attributes::OPACITY => 1,
             Attributes::ROTATION => 4,
-            Attributes::SH => 3 * sh_coefficients(sh_degree),
+            Attributes::SH => 3 * sh_coefficient_count(sh_degree),
             _ => 3,
         };
         self.iter().map(components).sum()

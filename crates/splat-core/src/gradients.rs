@@ -12,19 +12,19 @@ use super::{AttributeValues, Attributes, Gaussians};
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gradients {
     len: usize,
-    columns: Attributes,
+    attributes: Attributes,
     /// Derivatives of the loss, in the layout of [`Gaussians`]. The planes of attributes that are not differentiated
     /// have length 0.
     sums: Gaussians,
 }
 
 impl Gradients {
-    /// Creates derivatives that are all 0, for the attributes `columns` of `len` Gaussians, with SH coefficients up to
-    /// degree `sh_degree`.
-    pub fn new(len: usize, columns: Attributes, sh_degree: usize) -> Self {
+    /// Creates derivatives that are all 0, for the attributes `attributes` of `len` Gaussians, with SH coefficients up
+    /// to degree `sh_degree`.
+    pub fn new(len: usize, attributes: Attributes, sh_degree: usize) -> Self {
         let mut sums = Gaussians::zeros(0, sh_degree);
-        sums.columns_mut(columns).for_each(|column| column.resize(len));
-        Gradients { len, columns, sums }
+        sums.selected_attribute_values_mut(attributes).for_each(|column| column.resize(len));
+        Gradients { len, attributes, sums }
     }
 
     /// Returns the number of Gaussians.
@@ -38,8 +38,8 @@ impl Gradients {
     }
 
     /// Returns the attributes that are differentiated.
-    pub fn columns(&self) -> Attributes {
-        self.columns
+    pub fn attributes(&self) -> Attributes {
+        self.attributes
     }
 
     /// Returns the derivatives of the loss with respect to the single attribute `which`. Their planes have length 0 if
@@ -47,21 +47,21 @@ impl Gradients {
     ///
     /// # Panics
     /// Panics if `which` is not exactly one attribute.
-    pub fn column(&self, which: Attributes) -> &AttributeValues {
-        self.sums.column(which)
+    pub fn derivatives(&self, which: Attributes) -> &AttributeValues {
+        self.sums.attribute_values(which)
     }
 
     /// Returns the derivatives of the loss with respect to the single attribute `which` for writing.
     ///
     /// # Panics
     /// Panics if `which` is not exactly one attribute.
-    pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
-        self.sums.column_mut(which)
+    pub fn derivatives_mut(&mut self, which: Attributes) -> &mut AttributeValues {
+        self.sums.attribute_values_mut(which)
     }
 
     /// Sets all derivatives to 0.
     pub fn clear(&mut self) {
-        self.sums.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
+        self.sums.selected_attribute_values_mut(self.attributes).for_each(|column| column.planes_mut().fill(0.0));
     }
 
     /// Copies the derivatives of Gaussian k of `source` to Gaussian `rows[k]`, for every k.
@@ -70,8 +70,8 @@ impl Gradients {
     /// Panics if `source` lacks an attribute, if its number of Gaussians is not the length of `rows`, or if an index in
     /// `rows` is out of range.
     pub fn set_rows(&mut self, rows: &[u32], source: &Gradients) {
-        for column in self.columns.iter() {
-            let (from, to) = (source.column(column), self.sums.column_mut(column));
+        for column in self.attributes.iter() {
+            let (from, to) = (source.derivatives(column), self.sums.attribute_values_mut(column));
             for c in 0..to.width() {
                 let (from, to) = (from.plane(c), to.plane_mut(c));
                 assert_eq!(from.len(), rows.len(), "one row per Gaussian of the source expected");
@@ -88,8 +88,8 @@ impl Gradients {
     pub fn spans(&mut self, len: usize) -> Vec<GradientSpan<'_>> {
         let ids = (0..self.len).step_by(len).map(|first| first..self.len.min(first + len));
         let mut spans: Vec<GradientSpan<'_>> =
-            ids.map(|ids| GradientSpan { ids, columns: self.columns, planes: Default::default() }).collect();
-        for (index, column) in self.sums.columns_mut(Attributes::all()).enumerate() {
+            ids.map(|ids| GradientSpan { ids, attributes: self.attributes, planes: Default::default() }).collect();
+        for (index, column) in self.sums.selected_attribute_values_mut(Attributes::all()).enumerate() {
             // An attribute that is not differentiated has no values, hence no chunks.
             for plane in column.planes_mut().chunks_exact_mut(self.len.max(1)) {
                 spans.iter_mut().zip(plane.chunks_mut(len)).for_each(|(span, part)| span.planes[index].push(part));
@@ -104,7 +104,7 @@ impl Gradients {
 #[derive(Debug)]
 pub struct GradientSpan<'a> {
     ids: Range<usize>,
-    columns: Attributes,
+    attributes: Attributes,
     /// Derivatives of the loss with respect to each attribute, in the order of [`Attributes::all`]: one plane per
     /// component, and no planes for an attribute that is not differentiated.
     planes: [Vec<&'a mut [f32]>; 5],
@@ -117,8 +117,8 @@ impl<'a> GradientSpan<'a> {
     }
 
     /// Returns the attributes that are differentiated.
-    pub fn columns(&self) -> Attributes {
-        self.columns
+    pub fn attributes(&self) -> Attributes {
+        self.attributes
     }
 
     /// Returns the derivatives of the loss with respect to the single attribute `column`, one plane per component.
@@ -153,9 +153,9 @@ mod tests {
 
     #[test]
     fn spans_cover_every_differentiated_sum_once() {
-        let columns = Attributes::POSITION | Attributes::SH;
+        let attributes = Attributes::POSITION | Attributes::SH;
         for (len, span) in [(0, 3), (1, 3), (7, 3), (6, 3), (5, 100)] {
-            let mut gradients = Gradients::new(len, columns, 1);
+            let mut gradients = Gradients::new(len, attributes, 1);
             for mut span in gradients.spans(span) {
                 let ids = span.ids();
                 for c in 0..48 {
@@ -164,10 +164,10 @@ mod tests {
                     }
                 }
             }
-            assert!(gradients.column(Attributes::ROTATION).is_empty());
+            assert!(gradients.derivatives(Attributes::ROTATION).is_empty());
             for id in 0..len {
-                assert_eq!(gradients.column(Attributes::POSITION).row(id), [0.0, 1.0, 2.0]);
-                assert_eq!(gradients.column(Attributes::SH).row::<12>(id), std::array::from_fn(|c| c as f32));
+                assert_eq!(gradients.derivatives(Attributes::POSITION).row(id), [0.0, 1.0, 2.0]);
+                assert_eq!(gradients.derivatives(Attributes::SH).row::<12>(id), std::array::from_fn(|c| c as f32));
             }
         }
     }
@@ -178,6 +178,6 @@ mod tests {
         for term in [3e38, f32::NAN, 3e38, f32::NEG_INFINITY, -1e38] {
             gradients.spans(1)[0].add(Attributes::OPACITY, 0, 0, [term]);
         }
-        assert_eq!(gradients.column(Attributes::OPACITY).plane(0), [3e38f32 - 1e38]);
+        assert_eq!(gradients.derivatives(Attributes::OPACITY).plane(0), [3e38f32 - 1e38]);
     }
 }

@@ -27,25 +27,25 @@ impl Jacobian {
 
     /// Returns the derivative of the single attribute `which` at the frame with respect to its stored values. The
     /// derivative has no planes (width 0) if it is the identity.
-    pub fn column(&self, which: Attributes) -> &AttributeValues {
+    pub fn derivative(&self, which: Attributes) -> &AttributeValues {
         &self.columns[attribute_index(which)]
     }
 
     /// Returns the derivative of the single attribute `which` at the frame with respect to its stored values, for
     /// writing.
-    pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
+    pub fn derivative_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         &mut self.columns[attribute_index(which)]
     }
 
     /// Returns the derivative of each attribute at the frame with respect to its stored values, in the order of
     /// [`Attributes::all`].
-    pub fn columns(&self) -> &[AttributeValues; 5] {
+    pub fn derivatives(&self) -> &[AttributeValues; 5] {
         &self.columns
     }
 
     /// Returns the derivative of each attribute at the frame with respect to its stored values, for writing, in the
     /// order of [`Attributes::all`].
-    pub fn columns_mut(&mut self) -> &mut [AttributeValues; 5] {
+    pub fn derivatives_mut(&mut self) -> &mut [AttributeValues; 5] {
         &mut self.columns
     }
 
@@ -85,7 +85,8 @@ impl Jacobian {
     /// coefficients stay unchanged.
     pub fn add_to(&self, change: &Gaussians, state: &mut Gaussians) {
         for which in Attributes::all().iter() {
-            let (factors, delta, to) = (self.column(which), change.column(which), state.column_mut(which));
+            let (factors, delta, to) =
+                (self.derivative(which), change.attribute_values(which), state.attribute_values_mut(which));
             if delta.is_empty() {
                 continue;
             }
@@ -110,8 +111,8 @@ impl Jacobian {
     /// Converts `gradients` in place by the chain rule: from derivatives of a loss with respect to the attributes at
     /// the frame to derivatives with respect to the stored attributes. Results that are not finite become 0.
     pub fn pull_back(&self, gradients: &mut Gradients) {
-        for which in gradients.columns().iter() {
-            let (factors, gradient) = (self.column(which), gradients.column_mut(which));
+        for which in gradients.attributes().iter() {
+            let (factors, gradient) = (self.derivative(which), gradients.derivatives_mut(which));
             let finite = |x: f32| if x.is_finite() { x } else { 0.0 };
             match (factors.width(), gradient.width()) {
                 (0, _) => (),
@@ -148,7 +149,7 @@ mod tests {
 
     fn noisy_gaussians(len: usize, step: f32) -> Gaussians {
         let mut filled = Gaussians::zeros(len, 1);
-        filled.columns_mut(Attributes::all()).for_each(|column| fill_with_noise(column, step));
+        filled.selected_attribute_values_mut(Attributes::all()).for_each(|column| fill_with_noise(column, step));
         filled
     }
 
@@ -157,8 +158,8 @@ mod tests {
     fn jacobian(len: usize) -> Jacobian {
         let mut filled = Jacobian::default();
         for (which, width) in [(Attributes::POSITION, 9), (Attributes::ROTATION, 16), (Attributes::OPACITY, 1)] {
-            *filled.column_mut(which) = AttributeValues::zeros(width, len);
-            fill_with_noise(filled.column_mut(which), 0.618_034);
+            *filled.derivative_mut(which) = AttributeValues::zeros(width, len);
+            fill_with_noise(filled.derivative_mut(which), 0.618_034);
         }
         filled
     }
@@ -169,15 +170,16 @@ mod tests {
         let mut state = Gaussians::zeros(11, 1);
         jacobian.add_to(&change, &mut state);
         let mut gradients = Gradients::new(11, Attributes::all(), 1);
-        Attributes::all().iter().for_each(|which| fill_with_noise(gradients.column_mut(which), 0.569_84));
+        Attributes::all().iter().for_each(|which| fill_with_noise(gradients.derivatives_mut(which), 0.569_84));
         let dot = |a: &AttributeValues, b: &AttributeValues| -> f64 {
             a.planes().iter().zip(b.planes()).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
         };
-        let expected = Attributes::all().iter().map(|which| dot(gradients.column(which), state.column(which)));
+        let expected =
+            Attributes::all().iter().map(|which| dot(gradients.derivatives(which), state.attribute_values(which)));
         let expected: Vec<f64> = expected.collect();
         jacobian.pull_back(&mut gradients);
         for (which, expected) in Attributes::all().iter().zip(expected) {
-            let got = dot(gradients.column(which), change.column(which));
+            let got = dot(gradients.derivatives(which), change.attribute_values(which));
             assert!((got - expected).abs() < 1e-5, "{}: got {got}, expected {expected}", which.name());
         }
     }
@@ -196,13 +198,13 @@ mod tests {
     #[test]
     fn pulled_back_values_that_are_not_finite_become_zero() {
         let mut jacobian = jacobian(2);
-        jacobian.column_mut(Attributes::POSITION).planes_mut()[0] = f32::MAX;
-        jacobian.column_mut(Attributes::OPACITY).planes_mut()[0] = f32::MAX;
+        jacobian.derivative_mut(Attributes::POSITION).planes_mut()[0] = f32::MAX;
+        jacobian.derivative_mut(Attributes::OPACITY).planes_mut()[0] = f32::MAX;
         let mut gradients = Gradients::new(2, Attributes::all(), 0);
-        Attributes::all().iter().for_each(|which| gradients.column_mut(which).planes_mut().fill(3.0));
+        Attributes::all().iter().for_each(|which| gradients.derivatives_mut(which).planes_mut().fill(3.0));
         jacobian.pull_back(&mut gradients);
-        assert_eq!(gradients.column(Attributes::POSITION).plane(0)[0], 0.0);
-        assert_eq!(gradients.column(Attributes::OPACITY).plane(0)[0], 0.0);
-        assert_ne!(gradients.column(Attributes::OPACITY).plane(0)[1], 0.0);
+        assert_eq!(gradients.derivatives(Attributes::POSITION).plane(0)[0], 0.0);
+        assert_eq!(gradients.derivatives(Attributes::OPACITY).plane(0)[0], 0.0);
+        assert_ne!(gradients.derivatives(Attributes::OPACITY).plane(0)[1], 0.0);
     }
 }

@@ -38,7 +38,7 @@ pub use hash::hash_id;
 pub use jacobian::Jacobian;
 pub use ranges::format_ranges;
 pub use raw::StoredParams;
-pub use rig::{Rig, Shot, Split};
+pub use rig::{Rig, RigView, Split};
 pub use robust_box::RobustBox;
 pub use rows::{AnomalyFlags, Statistic, StatisticArray, StatisticRows};
 pub use schedule::{FrameView, ViewSchedule};
@@ -79,7 +79,7 @@ pub fn sh_from_color(color: f64) -> f32 {
 }
 
 /// Returns the number of SH coefficients per color channel up to `degree`, which is (`degree` + 1)².
-pub const fn sh_coefficients(degree: usize) -> usize {
+pub const fn sh_coefficient_count(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
 

@@ -41,7 +41,7 @@ impl StoredParams {
             (0..column.width()).for_each(|c| column.plane_mut(c)[to] = from.plane(c)[row]);
         };
         for column in Attributes::all().iter() {
-            set(self.gaussians.column_mut(column), from.gaussians.column(column));
+            set(self.gaussians.attribute_values_mut(column), from.gaussians.attribute_values(column));
         }
         set(&mut self.format_specific, &from.format_specific);
     }
@@ -62,7 +62,7 @@ mod tests {
     #[test]
     fn pick_and_set_row_copy_all_parameters() {
         let mut raw = StoredParams { gaussians: Gaussians::zeros(3, 1), format_specific: AttributeValues::zeros(2, 3) };
-        raw.gaussians.columns_mut(Attributes::all()).for_each(|column| {
+        raw.gaussians.selected_attribute_values_mut(Attributes::all()).for_each(|column| {
             column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = k as f32);
         });
         raw.format_specific.set_row(2, [7.0, 8.0]);

@@ -22,7 +22,7 @@ pub enum Split {
 
 /// View of the scene: a camera at a time stamp. There may be a photograph of it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Shot {
+pub struct RigView {
     /// Number of the view in the data set.
     pub view: u32,
     /// Index into [`Rig::cameras`].
@@ -41,7 +41,7 @@ pub struct Rig {
     /// Distinct cameras; several views may share one.
     pub cameras: Vec<Camera>,
     /// Views of all cameras, in the order of the camera file.
-    pub shots: Vec<Shot>,
+    pub views: Vec<RigView>,
     /// Background color, linear RGB in [0, 1], if the camera file gives one.
     pub background: Option<[f32; 3]>,
     /// Source of the cameras for messages: the path of the camera file, or a description of a virtual rig (cameras that
@@ -59,20 +59,20 @@ impl Rig {
     pub const BYTES_PER_CAMERA: u64 = 2 * size_of::<Camera>() as u64 + 16;
 
     /// Bytes of memory per view, except its camera and the path of its photograph. This is the sum of:
-    /// - a [`Shot`];
+    /// - a [`RigView`];
     /// - 32 bytes for entries in two tables while the camera file is read;
     /// - 3 × 40 bytes for an entry in a [`ViewSchedule`], because a vector that grows needs its old memory and twice as
     ///   much new memory.
-    pub const BYTES_PER_VIEW: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
+    pub const BYTES_PER_VIEW: u64 = size_of::<RigView>() as u64 + 32 + 3 * 40;
 
     /// Bytes of memory per path of a photograph, in addition to its text: the overhead of the allocator.
     pub const NAME_OVERHEAD_BYTES: u64 = 32;
 
     /// Returns the bytes of memory that all cameras and views take, including one [`ViewSchedule`] of them.
     pub fn bytes(&self) -> u64 {
-        let names = self.shots.iter().filter_map(|shot| shot.image.as_ref());
+        let names = self.views.iter().filter_map(|rig_view| rig_view.image.as_ref());
         let names: u64 = names.map(|image| image.as_os_str().len() as u64 + Rig::NAME_OVERHEAD_BYTES).sum();
-        Rig::BYTES_PER_CAMERA * self.cameras.len() as u64 + Rig::BYTES_PER_VIEW * self.shots.len() as u64 + names
+        Rig::BYTES_PER_CAMERA * self.cameras.len() as u64 + Rig::BYTES_PER_VIEW * self.views.len() as u64 + names
     }
 
     /// Returns the distinct times of all views in increasing order. Returns no times if no view has a time.
@@ -80,7 +80,7 @@ impl Rig {
     /// Times that differ by at most half the tolerance of [`Rig::schedule`] count as equal, because training and test
     /// views of one moment may have been rounded differently.
     pub fn times(&self) -> Vec<f64> {
-        let mut times: Vec<f64> = self.shots.iter().filter_map(|shot| shot.time).collect();
+        let mut times: Vec<f64> = self.views.iter().filter_map(|rig_view| rig_view.time).collect();
         times.sort_by(f64::total_cmp);
         let near = 0.5 * TIME_TOLERANCE * span(&times);
         times.dedup_by(|later, kept| *later - *kept <= near);
@@ -90,7 +90,7 @@ impl Rig {
     /// Returns the split of the views that were held out of training: test, or validation if there are no test views.
     /// Returns `None` if all views are training views.
     pub fn held_out_split(&self) -> Option<Split> {
-        [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
+        [Split::Test, Split::Val].into_iter().find(|split| self.views.iter().any(|rig_view| rig_view.split == *split))
     }
 
     /// Returns the maximum allowed difference between the time of a view and the time of its frame, in the unit of the
@@ -114,9 +114,9 @@ impl Rig {
     /// Fails with [`Error::Usage`] if no frame has the time of a view of the split.
     pub fn schedule(&self, frame_times: &[f64], split: Option<Split>) -> Result<ViewSchedule> {
         let (mut timed, mut timeless) = (Vec::new(), Vec::new());
-        for (place, shot) in self.shots.iter().enumerate() {
-            if split.is_none_or(|split| split == shot.split) {
-                match self.frame_of(shot, frame_times)? {
+        for (place, rig_view) in self.views.iter().enumerate() {
+            if split.is_none_or(|split| split == rig_view.split) {
+                match self.frame_of(rig_view, frame_times)? {
                     None => timeless.push(place),
                     Some(frame) => timed.push((frame, place)),
                 }
@@ -125,7 +125,7 @@ impl Rig {
         timed.sort_unstable();
         let views_of = |mut places: Vec<usize>| -> Vec<(u32, u32)> {
             places.sort_unstable();
-            places.iter().map(|&place| (self.shots[place].view, self.shots[place].camera)).collect()
+            places.iter().map(|&place| (self.views[place].view, self.views[place].camera)).collect()
         };
         let mut schedule = ViewSchedule::new(self.cameras.clone());
         for of_one_frame in timed.chunk_by(|a, b| a.0 == b.0) {
@@ -139,29 +139,29 @@ impl Rig {
         Ok(schedule)
     }
 
-    /// Returns the index of the frame whose time is nearest to the time of the view `shot`. Returns `None` if the view
-    /// has no time, and so belongs to every frame. `frame_times` are the increasing times of the frames.
+    /// Returns the index of the frame whose time is nearest to the time of the view `rig_view`. Returns `None` if the
+    /// view has no time, and so belongs to every frame. `frame_times` are the increasing times of the frames.
     ///
     /// # Errors
     /// Fails with [`Error::Usage`] if the two times differ by more than the tolerance of [`Rig::schedule`].
-    pub fn frame_of(&self, shot: &Shot, frame_times: &[f64]) -> Result<Option<usize>> {
-        let Some(time) = shot.time else { return Ok(None) };
+    pub fn frame_of(&self, rig_view: &RigView, frame_times: &[f64]) -> Result<Option<usize>> {
+        let Some(time) = rig_view.time else { return Ok(None) };
         let tolerance = TIME_TOLERANCE * if frame_times.len() > 1 { span(frame_times) } else { 1.0 };
         nearest(frame_times, time)
             .filter(|&frame| (frame_times[frame] - time).abs() <= tolerance)
             .map(Some)
-            .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))
+            .ok_or_else(|| self.no_such_frame(rig_view.view, time, frame_times))
     }
 
     /// Returns the path of the photograph that belongs to `view` (a camera at a frame). Returns `None` if the camera
     /// file names no photograph for it. `frame_times` are the increasing times of the frames.
     pub fn image_path(&self, view: FrameView, frame_times: &[f64]) -> Option<&Path> {
-        let shows = |shot: &&Shot| {
-            let frame = || self.frame_of(shot, frame_times).ok();
-            (shot.view, shot.camera) == (view.view, view.camera)
+        let shows = |rig_view: &&RigView| {
+            let frame = || self.frame_of(rig_view, frame_times).ok();
+            (rig_view.view, rig_view.camera) == (view.view, view.camera)
                 && frame().is_some_and(|frame| frame.is_none_or(|frame| frame == view.frame))
         };
-        self.shots.iter().find(shows)?.image.as_deref()
+        self.views.iter().find(shows)?.image.as_deref()
     }
 
     /// Creates the error of a view whose `time` is not the time of any frame.
@@ -203,13 +203,13 @@ mod tests {
 
     use super::*;
 
-    fn rig(shots: &[(u32, Option<f64>, Split)]) -> Rig {
+    fn rig(rig_views: &[(u32, Option<f64>, Split)]) -> Rig {
         let camera = |view: u32| Camera::look_at(DVec3::new(f64::from(view), -5.0, 1.0), DVec3::ZERO, 1.0, (64, 48));
-        let views = shots.iter().map(|shot| shot.0).max().map_or(0, |last| last + 1);
-        let shot = |&(view, time, split)| Shot { view, camera: view, time, split, image: None };
+        let views = rig_views.iter().map(|rig_view| rig_view.0).max().map_or(0, |last| last + 1);
+        let rig_view = |&(view, time, split)| RigView { view, camera: view, time, split, image: None };
         Rig {
             cameras: (0..views).map(camera).collect(),
-            shots: shots.iter().map(shot).collect(),
+            views: rig_views.iter().map(rig_view).collect(),
             background: None,
             origin: "test.json".into(),
         }
@@ -218,8 +218,8 @@ mod tests {
     #[test]
     fn synchronized_views_belong_to_their_frames() {
         let times = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
-        let shots: Vec<_> = times.iter().flat_map(|&t| (0..3).map(move |v| (v, Some(t), Split::Train))).collect();
-        let rig = rig(&shots);
+        let rig_views: Vec<_> = times.iter().flat_map(|&t| (0..3).map(move |v| (v, Some(t), Split::Train))).collect();
+        let rig = rig(&rig_views);
         assert_eq!(rig.times(), times);
         let schedule = rig.schedule(&times, Some(Split::Train)).unwrap();
         assert_eq!(schedule.pair_count(), 12);
@@ -263,11 +263,11 @@ mod tests {
     #[test]
     fn rounded_times_belong_to_one_frame() {
         let exact: Vec<f64> = (0..60).map(|t| f64::from(t) / 59.0).collect();
-        let shots: Vec<_> = exact
+        let rig_views: Vec<_> = exact
             .iter()
             .flat_map(|&t| [(0, Some(t), Split::Train), (1, Some((t * 1e8).round() / 1e8), Split::Test)])
             .collect();
-        let rig = rig(&shots);
+        let rig = rig(&rig_views);
         let times = rig.times();
         assert_eq!(times.len(), 60);
         assert!(rig.schedule(&times, None).unwrap().iter().all(|views| views.len() == 2));
@@ -276,8 +276,8 @@ mod tests {
     #[test]
     fn a_million_frames_are_distinguished() {
         const T: usize = 1_000_000;
-        let shots: Vec<_> = (0..T).map(|t| (0, Some(t as f64 / (T - 1) as f64), Split::Train)).collect();
-        let rig = rig(&shots);
+        let rig_views: Vec<_> = (0..T).map(|t| (0, Some(t as f64 / (T - 1) as f64), Split::Train)).collect();
+        let rig = rig(&rig_views);
         let times = rig.times();
         assert_eq!(times.len(), T);
         assert!(rig.schedule(&times, None).unwrap().iter().all(|views| views.len() == 1));

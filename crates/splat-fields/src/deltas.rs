@@ -36,7 +36,7 @@ impl Deltas {
     /// the fields [`Deltas::active`] and [`Deltas::multiply_rotation`] to the arguments.
     pub(super) fn begin(&mut self, rows: usize, active: Attributes, multiply_rotation: bool) {
         for column in active.iter() {
-            self.delta.column_mut(column).resize(rows);
+            self.delta.attribute_values_mut(column).resize(rows);
         }
         self.active = active;
         self.multiply_rotation = multiply_rotation;
@@ -46,8 +46,8 @@ impl Deltas {
     /// and writes the result to `state`, for the attributes `want` only. Resizes these attributes of `state`.
     pub fn apply(&self, raw: &Gaussians, want: Attributes, state: &mut Gaussians) {
         for column in want.iter() {
-            let from = raw.column(column);
-            let to = state.column_mut(column);
+            let from = raw.attribute_values(column);
+            let to = state.attribute_values_mut(column);
             to.resize(from.len());
             if !self.active.contains(column) {
                 to.planes_mut().copy_from_slice(from.planes());
@@ -57,7 +57,7 @@ impl Deltas {
                 }
             } else {
                 let mask = self.mask.as_deref().filter(|_| column != Attributes::ROTATION);
-                let delta = self.delta.column(column);
+                let delta = self.delta.attribute_values(column);
                 for c in 0..from.width() {
                     let planes = to.plane_mut(c).iter_mut().zip(from.plane(c)).zip(delta.plane(c));
                     match mask {
@@ -77,19 +77,20 @@ impl Deltas {
     pub(super) fn jacobian(&self, rotation: &AttributeValues, out: &mut Jacobian) {
         for column in self.active.iter() {
             if column == Attributes::ROTATION && self.multiply_rotation {
-                *out.column_mut(column) = AttributeValues::zeros(16, rotation.len());
+                *out.derivative_mut(column) = AttributeValues::zeros(16, rotation.len());
                 for i in 0..rotation.len() {
                     let (raw, delta) = (rotation.row(i), self.delta.rotation.row(i));
                     for component in 0..4 {
                         let by_state = std::array::from_fn(|c| f32::from(u8::from(c == component)));
                         let by_raw = unit_product_gradient(raw, delta, by_state);
                         for (c, derivative) in by_raw.into_iter().enumerate() {
-                            out.column_mut(column).plane_mut(4 * component + c)[i] = finite(derivative);
+                            out.derivative_mut(column).plane_mut(4 * component + c)[i] = finite(derivative);
                         }
                     }
                 }
             } else if let Some(mask) = self.mask.as_ref().filter(|_| column != Attributes::ROTATION) {
-                *out.column_mut(column) = AttributeValues::from_planes(1, mask.iter().copied().map(finite).collect());
+                *out.derivative_mut(column) =
+                    AttributeValues::from_planes(1, mask.iter().copied().map(finite).collect());
             }
         }
     }
@@ -101,8 +102,8 @@ impl Deltas {
     /// no stored value leads to `state`, and the result is not finite.
     pub fn invert(&self, state: &Gaussians, want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
-            let from = state.column(column);
-            let to = raw.column_mut(column);
+            let from = state.attribute_values(column);
+            let to = raw.attribute_values_mut(column);
             to.resize(from.len());
             if !self.active.contains(column) {
                 to.planes_mut().copy_from_slice(from.planes());
@@ -116,7 +117,7 @@ impl Deltas {
             } else {
                 let mask = self.mask.as_deref().filter(|_| column != Attributes::ROTATION);
                 for c in 0..from.width() {
-                    let delta = self.delta.column(column).plane(c);
+                    let delta = self.delta.attribute_values(column).plane(c);
                     for (i, to) in to.plane_mut(c).iter_mut().enumerate() {
                         *to = (from.plane(c)[i] - delta[i]) / mask.map_or(1.0, |mask| mask[i]);
                     }

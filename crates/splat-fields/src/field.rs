@@ -145,7 +145,7 @@ impl Field {
         let mut wanted: Vec<_> = config
             .deformed_attributes
             .iter()
-            .map(|column| (Some(column), head_name(column), shape.column(column).width()))
+            .map(|column| (Some(column), head_name(column), shape.attribute_values(column).width()))
             .collect();
         let mask = if config.static_mlp {
             wanted.push((None, ("static_mlp", "static_mlp=True"), 1));
@@ -259,7 +259,8 @@ impl Field {
         }
         let want = want & self.config.deformed_attributes;
         if let Some(head) = self.heads.iter().find(|head| {
-            head.column.is_some_and(|c| want.contains(c) && out.delta.column(c).width() != head.output.outputs)
+            head.column
+                .is_some_and(|c| want.contains(c) && out.delta.attribute_values(c).width() != head.output.outputs)
         }) {
             let name = head.column.map_or("mask", Attributes::name);
             return Err(Error::internal(format!(
@@ -340,7 +341,7 @@ impl Field {
             for head in &self.heads {
                 let (planes, len) = match (head.column, &mut out.mask) {
                     (Some(column), _) if out.active.contains(column) => {
-                        let column = out.delta.column_mut(column);
+                        let column = out.delta.attribute_values_mut(column);
                         let len = column.len();
                         (column.planes_mut(), len)
                     }

@@ -66,7 +66,7 @@ impl Field {
             let head = self.heads.iter().find(|head| head.column == Some(Attributes::POSITION));
             if let Some(head) = head.filter(|_| want.contains(Attributes::POSITION)) {
                 let position = self.position_jacobian(head, &raw.position, prepared, time as f32)?;
-                *found.column_mut(Attributes::POSITION) = position;
+                *found.derivative_mut(Attributes::POSITION) = position;
             }
         }
         let held = match self.mask {

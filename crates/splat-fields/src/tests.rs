@@ -10,7 +10,7 @@ fn random_gaussians(len: usize) -> Gaussians {
     let mut noise = Noise(99);
     let mut gaussians = Gaussians::zeros(len, 3);
     for column in Attributes::all().iter() {
-        gaussians.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
+        gaussians.attribute_values_mut(column).planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
     }
     gaussians
 }
@@ -125,8 +125,10 @@ fn states_do_not_depend_on_block_or_requested_attributes() {
     for (start, len) in [(0, 1), (3, 7), (255, 2), (250, 513), (1099, 1)] {
         let mut part = Gaussians::zeros(len, 3);
         for column in Attributes::all().iter() {
-            for c in 0..raw.column(column).width() {
-                part.column_mut(column).plane_mut(c).copy_from_slice(&raw.column(column).plane(c)[start..start + len]);
+            for c in 0..raw.attribute_values(column).width() {
+                part.attribute_values_mut(column)
+                    .plane_mut(c)
+                    .copy_from_slice(&raw.attribute_values(column).plane(c)[start..start + len]);
             }
         }
         for want in
@@ -134,10 +136,12 @@ fn states_do_not_depend_on_block_or_requested_attributes() {
         {
             let (state, _) = states(&field, &part, 0.6, want);
             for column in want.iter() {
-                for c in 0..state.column(column).width() {
+                for c in 0..state.attribute_values(column).width() {
                     for i in 0..len {
-                        let (got, expected) =
-                            (state.column(column).plane(c)[i], all.column(column).plane(c)[start + i]);
+                        let (got, expected) = (
+                            state.attribute_values(column).plane(c)[i],
+                            all.attribute_values(column).plane(c)[start + i],
+                        );
                         assert_eq!(
                             got.to_bits(),
                             expected.to_bits(),
@@ -165,7 +169,8 @@ fn invert_is_the_inverse_of_apply() {
         deltas.apply(&solved, Attributes::all(), &mut again);
         for column in Attributes::all().iter() {
             for (i, mask) in mask.iter().enumerate() {
-                let (got, expected) = (values(again.column(column), i), values(state.column(column), i));
+                let (got, expected) =
+                    (values(again.attribute_values(column), i), values(state.attribute_values(column), i));
                 for (got, expected) in got.into_iter().zip(expected) {
                     let tolerance = 1e-5 * (1.0 + expected.abs());
                     assert!(
@@ -210,7 +215,7 @@ fn an_empty_block_is_empty() {
     assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Attributes::all()).0.is_empty());
     let none = Gaussians::zeros(0, 3);
     let empty = field.jacobian(&none, &field.prepare_with_slopes(&none.position), 0.5, Attributes::POSITION).unwrap();
-    assert!(empty.column(Attributes::POSITION).is_empty());
+    assert!(empty.derivative(Attributes::POSITION).is_empty());
 }
 
 #[test]
@@ -308,7 +313,7 @@ fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
     let mut noise = Noise(5);
     let mut gradients = Gradients::new(len, Attributes::all(), 3);
     for column in columns.iter() {
-        gradients.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = noise.next());
+        gradients.derivatives_mut(column).planes_mut().iter_mut().for_each(|x| *x = noise.next());
     }
     gradients
 }
@@ -318,7 +323,7 @@ fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
 fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients) -> Gradients {
     let mut pulled = gradients.clone();
     field
-        .jacobian(raw, &field.prepare_with_slopes(&raw.position), time, gradients.columns())
+        .jacobian(raw, &field.prepare_with_slopes(&raw.position), time, gradients.attributes())
         .unwrap()
         .pull_back(&mut pulled);
     pulled
@@ -336,8 +341,8 @@ fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize
         let by_state = noisy_gradients(raw.len(), column);
         let by_raw = pulled_back(&field, &raw, time, &by_state);
         for i in 0..raw.len() {
-            let weights = values(by_state.column(column), i);
-            for c in 0..raw.column(column).width() {
+            let weights = values(by_state.derivatives(column), i);
+            for c in 0..raw.attribute_values(column).width() {
                 let value = |step: f64| -> f64 {
                     let mut nudged = Parameters::from_row(&raw, i);
                     column_mut(&mut nudged, column)[c] += step;
@@ -346,7 +351,7 @@ fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize
                 };
                 let step = 1e-7;
                 let expected = (value(step) - value(-step)) / (2.0 * step);
-                let got = f64::from(by_raw.column(column).plane(c)[i]);
+                let got = f64::from(by_raw.derivatives(column).plane(c)[i]);
                 // Allows for f32 rounding in about a hundred sums. A wrong axis, mask or order causes an error of 0.1.
                 // A kink of a ReLU or of a plane within the step of the finite difference would also fail; the fixed
                 // random data has none.
@@ -402,8 +407,8 @@ fn derivative_of_masked_positions_is_the_mask() {
     let by_state = noisy_gradients(raw.len(), Attributes::POSITION);
     let by_raw = pulled_back(&field, &raw, 0.3, &by_state);
     for (i, mask) in deltas.mask.unwrap().into_iter().enumerate() {
-        let expected = by_state.column(Attributes::POSITION).row::<3>(i).map(|x| mask * x);
-        assert_eq!(by_raw.column(Attributes::POSITION).row(i), expected, "Gaussian {i}");
+        let expected = by_state.derivatives(Attributes::POSITION).row::<3>(i).map(|x| mask * x);
+        assert_eq!(by_raw.derivatives(Attributes::POSITION).row(i), expected, "Gaussian {i}");
     }
 }
 
@@ -438,7 +443,7 @@ fn derivatives_at_extreme_positions_are_finite() {
         }
         let by_raw = pulled_back(&field, &raw, 0.6, &noisy_gradients(8, Attributes::all()));
         for column in Attributes::all().iter() {
-            assert!(by_raw.column(column).planes().iter().all(|x| x.is_finite()), "{}", column.name());
+            assert!(by_raw.derivatives(column).planes().iter().all(|x| x.is_finite()), "{}", column.name());
         }
     }
 }

@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use super::convention::BLOCK;
-use splat_core::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficients};
+use splat_core::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficient_count};
 
 /// Red, green and blue of the Gaussians of one block.
 pub(super) type Colors = [[f32; BLOCK]; 3];
@@ -21,7 +21,7 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
     for channel in out.iter_mut() {
         channel[..n].fill(0.5);
     }
-    let mut values = [[0.0f32; BLOCK]; sh_coefficients(3)];
+    let mut values = [[0.0f32; BLOCK]; sh_coefficient_count(3)];
     let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
     for i in 0..n {
         let (direction, _) = direction([position[0][i], position[1][i], position[2][i]], center);
@@ -46,8 +46,8 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
 
 /// Returns how many SH coefficients per color channel are evaluated: the coefficients of all complete degrees up to 3.
 pub(super) fn coefficients(gaussians: &Gaussians) -> usize {
-    let fits = |&degree: &usize| 3 * sh_coefficients(degree) <= gaussians.sh.width();
-    (0..=MAX_SH_DEGREE).rev().find(fits).map_or(0, sh_coefficients)
+    let fits = |&degree: &usize| 3 * sh_coefficient_count(degree) <= gaussians.sh.width();
+    (0..=MAX_SH_DEGREE).rev().find(fits).map_or(0, sh_coefficient_count)
 }
 
 /// Returns the unit vector from `center` to `position`, and the reciprocal of their distance.
@@ -69,7 +69,7 @@ const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_34, 1.445
 
 /// Returns the values of the SH basis functions Y_k for the unit vector `[x, y, z]`.
 #[inline(always)]
-pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
+pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficient_count(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
     [
         SH_C0 as f32,
@@ -94,7 +94,7 @@ pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
 /// Returns the derivatives of the SH basis functions Y_k (see [`basis`]) with respect to x, y and z. The functions are
 /// differentiated as polynomials in x, y and z.
 #[inline(always)]
-pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficients(3)] {
+pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficient_count(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let times = |c: f32, v: [f32; 3]| [c * v[0], c * v[1], c * v[2]];
     [

@@ -451,10 +451,10 @@ mod tests {
         let parts: Vec<Gradients> = phases.map(|grid| gradient(grid.sampled_view(&camera))).collect();
         let whole = gradient((&camera).into());
         for column in Attributes::all().iter() {
-            let expected = whole.column(column).planes();
+            let expected = whole.derivatives(column).planes();
             let largest = expected.iter().fold(0.0f32, |largest, x| largest.max(x.abs()));
             for (i, &expected) in expected.iter().enumerate() {
-                let sum: f64 = parts.iter().map(|part| f64::from(part.column(column).planes()[i])).sum();
+                let sum: f64 = parts.iter().map(|part| f64::from(part.derivatives(column).planes()[i])).sum();
                 let error = (sum - f64::from(expected)).abs();
                 assert!(error <= f64::from(1e-5 * largest), "{column:?} {i}: got {sum}, expected {expected}");
             }

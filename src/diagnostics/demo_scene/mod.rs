@@ -19,7 +19,7 @@ use std::ops::Range;
 use glam::DVec3;
 
 use crate::error::{Error, Result};
-use crate::model::{Attributes, Camera, Gaussians, Rig, SequenceInfo, Shot, Split};
+use crate::model::{Attributes, Camera, Gaussians, Rig, RigView, SequenceInfo, Split};
 use crate::source::{BlockReader, FrameSource, Ids};
 use bodies::BodyLayout;
 use motion::DemoGaussian;
@@ -88,7 +88,7 @@ impl DemoScene {
             let eye = DVec3::new(-1.7 + 0.68 * f64::from(view), -4.2, 1.2 + 0.4 * f64::from(view % 2));
             Camera::look_at(eye, DVec3::new(0.0, 0.5, 1.0), 55f64.to_radians(), (256, 192))
         };
-        let shot = |view| Shot {
+        let rig_view = |view| RigView {
             view,
             camera: view,
             time: None,
@@ -97,7 +97,7 @@ impl DemoScene {
         };
         Rig {
             cameras: (0..CAMERAS).map(camera).collect(),
-            shots: (0..CAMERAS).map(shot).collect(),
+            views: (0..CAMERAS).map(rig_view).collect(),
             background: Some([0.0; 3]),
             origin: "demo scene".into(),
         }

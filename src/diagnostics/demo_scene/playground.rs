@@ -12,7 +12,7 @@ use super::motion::{
 };
 use super::{Reader, SH_DEGREE};
 use crate::error::Result;
-use crate::model::{Attributes, Camera, Rig, SequenceInfo, Shot, Split};
+use crate::model::{Attributes, Camera, Rig, RigView, SequenceInfo, Split};
 use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Number of cameras of [`Playground::rig`].
@@ -119,10 +119,10 @@ impl Playground {
             Camera::look_at(eye, DVec3::new(0.0, 0.2, 1.0), 50f64.to_radians(), RENDER)
         };
         let split = |view| if TEST_VIEWS.contains(&view) { Split::Test } else { Split::Train };
-        let shot = |view| Shot { view, camera: view, time: None, split: split(view), image: None };
+        let rig_view = |view| RigView { view, camera: view, time: None, split: split(view), image: None };
         Rig {
             cameras: (0..CAMERAS).map(camera).collect(),
-            shots: (0..CAMERAS).map(shot).collect(),
+            views: (0..CAMERAS).map(rig_view).collect(),
             background: Some([0.0; 3]),
             origin: "demo scene".into(),
         }

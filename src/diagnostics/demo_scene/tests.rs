@@ -45,7 +45,7 @@ fn gaussian_and_frame_give_the_same_bits_in_any_block() {
         let check = |ids: &[usize], part: &Gaussians| {
             assert_eq!(part.len(), ids.len());
             for column in Attributes::all().iter() {
-                let (whole, part) = (whole.column(column), part.column(column));
+                let (whole, part) = (whole.attribute_values(column), part.attribute_values(column));
                 for c in 0..whole.width() {
                     for (i, &id) in ids.iter().enumerate() {
                         let (got, expected) = (part.plane(c)[i], whole.plane(c)[id]);
@@ -71,7 +71,11 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
         for t in 0..frames {
             let state = frame(&scene, Ids::Range(0..count), t);
             for column in Attributes::all().iter() {
-                assert!(state.column(column).planes().iter().all(|x| x.is_finite()), "{} of {count}", column.name());
+                assert!(
+                    state.attribute_values(column).planes().iter().all(|x| x.is_finite()),
+                    "{} of {count}",
+                    column.name()
+                );
             }
             for i in 0..count {
                 let length: f32 = state.rotation.row::<4>(i).iter().map(|x| x * x).sum();
@@ -89,7 +93,8 @@ fn still_bodies_and_constant_columns_keep_every_bit() {
         let still =
             matches!(body, DemoBody::Wall | DemoBody::Double | DemoBody::Buried | DemoBody::Dust | DemoBody::Wire);
         for column in Attributes::all().iter() {
-            let constant = film.iter().all(|state| bits(state.column(column)) == bits(film[0].column(column)));
+            let constant =
+                film.iter().all(|state| bits(state.attribute_values(column)) == bits(film[0].attribute_values(column)));
             let must = still || !scene.info().varying.contains(column);
             assert!(constant || !must, "{body:?} {}", column.name());
         }
@@ -250,7 +255,7 @@ fn only_wanted_columns_are_written() {
     let whole = frame(&scene, Ids::Range(0..100), 1);
     assert_eq!((&out.opacity_logit, &out.sh), (&whole.opacity_logit, &whole.sh));
     for column in [Attributes::POSITION, Attributes::ROTATION, Attributes::LOG_SCALE] {
-        assert!(out.column(column).planes().iter().all(|&x| x == 0.0), "{}", column.name());
+        assert!(out.attribute_values(column).planes().iter().all(|&x| x == 0.0), "{}", column.name());
     }
 }
 

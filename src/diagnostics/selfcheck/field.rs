@@ -54,7 +54,7 @@ pub(super) fn derivative() -> CaseResult {
         let raw = random_gaussians(40);
         let found = field.jacobian(&raw, &field.prepare_with_slopes(&raw.position), time, Attributes::POSITION)?;
         let mut worst = LargestError::default();
-        worst.same(&found.column(Attributes::POSITION).width(), &9);
+        worst.same(&found.derivative(Attributes::POSITION).width(), &9);
         for i in 0..raw.len() {
             for input in 0..3 {
                 let [low, high] = [-step, step].map(|step| {
@@ -64,7 +64,7 @@ pub(super) fn derivative() -> CaseResult {
                 });
                 for output in 0..3 {
                     let expected = (high[output] - low[output]) / (2.0 * step);
-                    let got = f64::from(found.column(Attributes::POSITION).plane(3 * output + input)[i]);
+                    let got = f64::from(found.derivative(Attributes::POSITION).plane(3 * output + input)[i]);
                     worst.near(got, expected, 1.0 + expected.abs());
                 }
             }
@@ -77,7 +77,7 @@ pub(super) fn derivative() -> CaseResult {
 fn random_gaussians(count: usize) -> Gaussians {
     let mut noise = Noise(99);
     let mut random_gaussians = Gaussians::zeros(count, 3);
-    for column in random_gaussians.columns_mut(Attributes::all()) {
+    for column in random_gaussians.selected_attribute_values_mut(Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
     }
     random_gaussians

@@ -6,8 +6,8 @@ use glam::{DMat3, DQuat, DVec3};
 use super::case::{CaseResult, LargestError};
 use super::generated::clouds::{Random, random_gaussians};
 use crate::error::{Error, Result};
-use crate::merging::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
-use crate::merging::proxy::{Importance, merge_state, weights};
+use crate::merging::moments::{Ellipsoid, WeightedGaussian, moments, reorder_axes_to_match};
+use crate::merging::proxy::{Importance, merge_member_states, weights};
 use crate::merging::{Survivors, run};
 use crate::model::{Attributes, Gaussians};
 use crate::recipe::{MergeParams, ProxyOpacity, ProxyPosition, Recipe};
@@ -45,7 +45,7 @@ pub(super) fn needle() -> CaseResult {
         let rotation = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
         for scales in [DVec3::new(1e6, 1.0, 1e-6), DVec3::new(1e-6, 1e6, 1e-6), DVec3::new(1e-6, 3e-6, 1e6)] {
             let part = WeightedGaussian { weight: 0.5, position: DVec3::new(1.0, 2.0, 3.0), rotation, scales };
-            let found = align_axes(&moments(&[part, part], None), rotation);
+            let found = reorder_axes_to_match(&moments(&[part, part], None), rotation);
             (0..3).for_each(|axis| worst.relative(found.scales[axis], scales[axis]));
         }
         Ok(worst)
@@ -70,7 +70,7 @@ pub(super) fn proxy() -> CaseResult {
         let importance = Importance { ids: &rows, coverage: &coverage, visibility: &visibility };
         let members: Vec<(u32, f64)> = rows.into_iter().zip(weights(&rows, &importance, &states)).collect();
         let recipe = MergeParams { placement: ProxyPosition::Mean, ..recipe(ProxyOpacity::Union)? };
-        let found = merge_state(&members, &states, 2, &recipe, Attributes::all());
+        let found = merge_member_states(&members, &states, 2, &recipe, Attributes::all());
 
         let mut worst = LargestError::default();
         let parts: Vec<WeightedGaussian> = (0..5).map(|i| part(&states, i, seen[i] / total)).collect();
@@ -118,7 +118,10 @@ pub(super) fn duplicates() -> CaseResult {
             sorted.sort_unstable();
             worst.same(&sorted[..], &[&rows[..8], &rows[8..]]);
             for column in (Attributes::POSITION | Attributes::LOG_SCALE | Attributes::SH).iter() {
-                worst.same(merged.proxies.column(column).planes(), states.column(column).pick(&[0]).planes());
+                worst.same(
+                    merged.proxies.attribute_values(column).planes(),
+                    states.attribute_values(column).pick(&[0]).planes(),
+                );
             }
             let logit = f64::from(merged.proxies.opacity_logit.planes().first().copied().unwrap_or(f32::NAN));
             worst.near(1.0 / (1.0 + (-logit).exp()), expected, 1.0);

@@ -108,13 +108,13 @@ impl SelfcheckReport {
     /// Checks that every case passed.
     ///
     /// # Errors
-    /// Returns [`Error::Unsound`] with the names of all failed cases.
+    /// Returns [`Error::SelfCheckFailed`] with the names of all failed cases.
     pub fn check_passed(&self) -> Result<()> {
         let failed: Vec<&str> = self.cases.iter().filter(|case| !case.pass).map(|case| case.name).collect();
         if failed.is_empty() {
             return Ok(());
         }
-        Err(Error::Unsound(failed.join(", ")))
+        Err(Error::SelfCheckFailed(failed.join(", ")))
     }
 }
 

@@ -159,15 +159,15 @@ pub(super) fn gradients() -> CaseResult {
         };
         let mut worst = LargestError::default();
         for column in Attributes::all().iter() {
-            let got = found.column(column).planes();
+            let got = found.derivatives(column).planes();
             let mut largest: Vec<usize> = (0..got.len()).collect();
             largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
             for &at in largest.iter().take(20) {
                 let mut changed = scene.clone();
-                let middle = scene.column(column).planes()[at];
+                let middle = scene.attribute_values(column).planes()[at];
                 let both = [middle - 3e-5, middle + 3e-5];
                 let [low, high] = both.map(|x| {
-                    changed.column_mut(column).planes_mut()[at] = x;
+                    changed.attribute_values_mut(column).planes_mut()[at] = x;
                     loss(&changed)
                 });
                 worst.relative(got[at].into(), (high - low) / (f64::from(both[1]) - f64::from(both[0])));

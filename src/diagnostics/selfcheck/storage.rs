@@ -44,7 +44,8 @@ pub(super) fn bounded_container() -> CaseResult {
     CaseResult::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
         let mut worst = LargestError::default();
         let mut written = MemoryFrames::new();
-        for column in written.frames.iter_mut().flat_map(|frame| frame.columns_mut(Attributes::all())) {
+        for column in written.frames.iter_mut().flat_map(|frame| frame.selected_attribute_values_mut(Attributes::all()))
+        {
             column.planes_mut().iter_mut().filter(|x| !x.is_finite()).for_each(|x| *x = 0.0);
         }
         let requested = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
@@ -152,8 +153,8 @@ fn compare_round_trip(
         reader.read(frame, Attributes::all(), &mut state)?;
         for column in Attributes::all().iter() {
             // A missing value counts as NaN.
-            let got = state.column(column).planes().iter().copied().chain(repeat(f32::NAN));
-            let values = got.zip(expected.column(column).planes());
+            let got = state.attribute_values(column).planes().iter().copied().chain(repeat(f32::NAN));
+            let values = got.zip(expected.attribute_values(column).planes());
             values.for_each(|(got, &expected)| compare(got, expected, column));
         }
     }
@@ -213,7 +214,7 @@ struct StoredRows<'a> {
 impl BlockReader for StoredRows<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
-            *out.column_mut(column) = self.frames[frame].column(column).pick(&self.rows);
+            *out.attribute_values_mut(column) = self.frames[frame].attribute_values(column).pick(&self.rows);
         }
         Ok(())
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use splat_platform::{FileKind, is_system_folder};
 
-use super::named::{Owner, SUMMARY_FILE, entries, split_target};
+use super::ownership::{ListedFiles, SUMMARY_FILE, entries, split_target};
 use crate::error::{Error, Result, ShowPath};
 
 /// Kind of an output: file or folder.
@@ -130,9 +130,9 @@ pub(super) fn check_replace(target: &Path, kind: TargetKind, replace: Replace) -
 /// [`Error::Usage`] if it is not.
 fn check_folder(target: &Path) -> Result<()> {
     let shown = target.shown();
-    match Owner::read(&target.join(SUMMARY_FILE)) {
-        Owner::Listed(_) => Ok(()),
-        Owner::Unknown => Err(Error::usage(format!(
+    match ListedFiles::read(&target.join(SUMMARY_FILE)) {
+        ListedFiles::Listed(_) => Ok(()),
+        ListedFiles::Unknown => Err(Error::usage(format!(
             "{shown} is not a result of splatsieve (no {SUMMARY_FILE} in it that lists its files), so --overwrite leaves it as it is\n  \
              remove the folder first, or name another output"
         ))),

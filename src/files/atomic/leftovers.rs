@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use splat_platform::FolderHandle;
 
 use super::destination::{Replace, TargetKind, check_replace};
-use super::named::{SUMMARY_FILE, move_foreign_entries, split_target};
+use super::ownership::{SUMMARY_FILE, move_foreign_entries, split_target};
 use super::warnings::warn;
 use super::workspace::{
     DISCARDED, JOURNAL, Leftover, REPLACED, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace, publishing_name,

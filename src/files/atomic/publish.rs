@@ -8,7 +8,7 @@ use splat_platform::{FolderHandle, sync_file, sync_folder};
 
 use super::destination::{Replace, TargetKind, check_replace};
 use super::leftovers::{Journal, PublishLock, finish_publication, repair};
-use super::named::{exists, split_target};
+use super::ownership::{exists, split_target};
 use super::warnings::warn;
 use super::workspace::{JOURNAL, REPLACED, Workspace, live_workspaces};
 use crate::error::{Error, Result, ShowPath};

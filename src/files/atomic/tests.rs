@@ -258,7 +258,7 @@ fn foreign_files_in_a_result_are_kept() {
         write_file(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
     }
     staged.commit().unwrap();
-    let found = named::files_below(&target).unwrap();
+    let found = ownership::files_below(&target).unwrap();
     assert_eq!(
         found,
         [
@@ -391,9 +391,9 @@ fn a_summary_larger_than_the_limit_is_not_read() {
     let base = tempfile::tempdir().unwrap();
     let path = base.path().join("summary.json");
     write_file(&path, r#"{"tool": "splatsieve 0.1.0", "files": ["a"]}"#);
-    assert!(matches!(named::Owner::read(&path), named::Owner::Listed(_)));
+    assert!(matches!(ownership::ListedFiles::read(&path), ownership::ListedFiles::Listed(_)));
     File::options().write(true).open(&path).unwrap().set_len(3 << 30).unwrap();
-    assert_eq!(named::Owner::read(&path), named::Owner::Unknown);
+    assert_eq!(ownership::ListedFiles::read(&path), ownership::ListedFiles::Unknown);
 }
 
 #[test]

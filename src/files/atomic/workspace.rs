@@ -20,7 +20,7 @@ use std::time::Duration;
 
 use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_permissions};
 
-use super::named::{exists, split_target};
+use super::ownership::{exists, split_target};
 use crate::error::{Error, Result};
 
 /// Placeholder for the name of the output in the folder name `.NAME.RANDOM.splatsieve-tmp` of a workspace (hidden

@@ -11,7 +11,7 @@ use super::fields::place;
 use super::{MAX_IMAGES, MAX_SIDE_PX};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
-use crate::model::{Camera, Rig, Shot, Split};
+use crate::model::{Camera, Rig, RigView, Split};
 
 /// Maximum absolute entry of RᵀR − I of a rotation matrix R. Matrices written in f32 reach 1e-6; at 1e-4 a projected
 /// point moves by 0.05 px at a focal length of 1000 px. A scaled or sheared matrix exceeds the limit by far.
@@ -41,7 +41,7 @@ pub(super) struct ListedImage {
 /// numbers are used; otherwise the distinct cameras are numbered in order of appearance. An image without a time shows
 /// every frame, so a second image without a time of the same camera and split is left out.
 #[derive(Debug)]
-pub(super) struct Assembly {
+pub(super) struct RigBuilder {
     rig: Rig,
     memory_counter: MemoryCounter,
     /// Hash table for finding an equal camera: the index in `rig.cameras` of each camera, hashed by the camera's
@@ -50,7 +50,7 @@ pub(super) struct Assembly {
     hasher: DefaultHashBuilder,
     /// (Camera index, split) pairs for which an image without a time has been added.
     untimed: HashSet<(u32, Split)>,
-    /// Path of every camera file, and the index in `rig.shots` of its first image.
+    /// Path of every camera file, and the index in `rig.views` of its first image.
     files: Vec<(PathBuf, usize)>,
     /// Number of images added so far from the camera file that is being read (the last of `files`).
     taken: usize,
@@ -60,11 +60,11 @@ pub(super) struct Assembly {
     is_timed: Option<bool>,
 }
 
-impl Assembly {
+impl RigBuilder {
     /// Returns a builder without images; `memory` limits the memory of the images and cameras.
-    pub(super) fn new(memory: ReadLimit) -> Assembly {
-        Assembly {
-            rig: Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() },
+    pub(super) fn new(memory: ReadLimit) -> RigBuilder {
+        RigBuilder {
+            rig: Rig { cameras: Vec::new(), views: Vec::new(), background: None, origin: String::new() },
             memory_counter: MemoryCounter { limit: memory, used: 0 },
             known: HashTable::new(),
             hasher: DefaultHashBuilder::default(),
@@ -87,22 +87,22 @@ impl Assembly {
     /// # Errors
     /// Fails if there are too many images, or if they take more memory than allowed.
     pub(super) fn begin(&mut self, file: &Path, count: usize) -> Result<()> {
-        let total = self.rig.shots.len() + count;
+        let total = self.rig.views.len() + count;
         if total > MAX_IMAGES {
             return Err(Error::input(file, "", format!("at most {MAX_IMAGES} images"), total.to_string()));
         }
         self.memory_counter.take(file, "", &format!("{count} images"), Rig::BYTES_PER_VIEW * count as u64)?;
-        self.rig.shots.reserve_exact(count);
+        self.rig.views.reserve_exact(count);
         // Reserve one camera per image, up to a limit: usually either every image has its own camera or there are few
         // cameras. Reserved memory that stays unused costs nothing, but growing the list would copy it.
         let affordable = self.memory_counter.limit.bytes() / 4 / Rig::BYTES_PER_CAMERA;
         self.rig.cameras.reserve_exact(count.min(affordable.min(1 << 20) as usize));
-        self.files.push((file.to_owned(), self.rig.shots.len()));
+        self.files.push((file.to_owned(), self.rig.views.len()));
         self.taken = 0;
         Ok(())
     }
 
-    /// Adds the image `listed`, which belongs to the file that was last passed to [`Assembly::begin`].
+    /// Adds the image `listed`, which belongs to the file that was last passed to [`RigBuilder::begin`].
     ///
     /// # Errors
     /// Fails if the camera is invalid, if only some images have a time, or if the memory limit for reading is exceeded.
@@ -154,19 +154,19 @@ impl Assembly {
             self.memory_counter.take(path, &place(Some(frame)), "the names of images", bytes)?;
         }
         let view = listed.view.unwrap_or(0);
-        self.rig.shots.push(Shot { view, camera, time: listed.time, split: listed.split, image });
+        self.rig.views.push(RigView { view, camera, time: listed.time, split: listed.split, image });
         Ok(())
     }
 
     /// Returns the largest time stamp of the images added so far, but at least `least`.
     pub(super) fn latest(&self, least: f64) -> f64 {
-        self.rig.shots.iter().filter_map(|shot| shot.time).fold(least, f64::max)
+        self.rig.views.iter().filter_map(|rig_view| rig_view.time).fold(least, f64::max)
     }
 
     /// Divides the time stamps of all images by `span`, the largest time stamp, so that times run up to 1.
     pub(super) fn divide_times(&mut self, span: f64) {
-        for shot in &mut self.rig.shots {
-            shot.time = shot.time.map(|time| time / span);
+        for rig_view in &mut self.rig.views {
+            rig_view.time = rig_view.time.map(|time| time / span);
         }
     }
 
@@ -176,25 +176,25 @@ impl Assembly {
     /// # Errors
     /// Fails if there are no images, or if two images of one file have the same view, split and time.
     pub(super) fn finish(mut self, background: Option<[f32; 3]>, origin: String) -> Result<Rig> {
-        if let (true, Some((path, _))) = (self.rig.shots.is_empty(), self.files.first()) {
+        if let (true, Some((path, _))) = (self.rig.views.is_empty(), self.files.first()) {
             return Err(Error::input(path, "", "at least one image", "none"));
         }
         if !self.are_views_stated {
-            self.rig.shots.iter_mut().for_each(|shot| shot.view = shot.camera);
+            self.rig.views.iter_mut().for_each(|rig_view| rig_view.view = rig_view.camera);
         }
-        let shots = &self.rig.shots;
+        let rig_views = &self.rig.views;
         // Adding 0.0 turns −0 into 0, so that both count as the same time.
-        let shot_key = |at: usize| {
-            let shot: &Shot = &shots[at];
-            shot.time.map(|time| (shot.view, shot.split, (time + 0.0).to_bits()))
+        let view_key = |at: usize| {
+            let rig_view: &RigView = &rig_views[at];
+            rig_view.time.map(|time| (rig_view.view, rig_view.split, (time + 0.0).to_bits()))
         };
         for (k, (path, first)) in self.files.iter().enumerate() {
-            let end = self.files.get(k + 1).map_or(shots.len(), |next| next.1);
+            let end = self.files.get(k + 1).map_or(rig_views.len(), |next| next.1);
             let mut taken: HashTable<u32> = HashTable::new();
             for at in *first..end {
-                let Some(own) = shot_key(at) else { continue };
+                let Some(own) = view_key(at) else { continue };
                 let hash = self.hasher.hash_one(own);
-                if let Some(&before) = taken.find(hash, |&other| shot_key(other as usize) == Some(own)) {
+                if let Some(&before) = taken.find(hash, |&other| view_key(other as usize) == Some(own)) {
                     let (view, time) = (own.0, f64::from_bits(own.2));
                     return Err(Error::input(
                         path,
@@ -203,7 +203,7 @@ impl Assembly {
                         format!("view {view} at time {time} again, as in frame {}", before as usize - first),
                     ));
                 }
-                taken.insert_unique(hash, at as u32, |&other| self.hasher.hash_one(shot_key(other as usize)));
+                taken.insert_unique(hash, at as u32, |&other| self.hasher.hash_one(view_key(other as usize)));
             }
         }
         Ok(Rig { background, origin, ..self.rig })

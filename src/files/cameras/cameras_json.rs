@@ -22,7 +22,7 @@
 use std::path::Path;
 
 use super::CameraOptions;
-use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
+use super::assemble::{ListedImage, RigBuilder, from_camera_to_world, view_in_name};
 use super::fields::{CameraFields, place};
 use super::image_list::each_image;
 use super::times::{self, TimesSource};
@@ -45,13 +45,13 @@ pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimi
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
         return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
     }
-    let mut assembly = Assembly::new(memory);
-    assembly.begin(file, shared.list_len("frames")?)?;
+    let mut builder = RigBuilder::new(memory);
+    builder.begin(file, shared.list_len("frames")?)?;
     each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
-        assembly.add(per_image(file, CameraFields::new(file, Some(index), frame)?)?)
+        builder.add(per_image(file, CameraFields::new(file, Some(index), frame)?)?)
     })?;
     let background = background.map(|rgb| rgb.map(|c| c as f32));
-    assembly.finish(background, shown_name(file))
+    builder.finish(background, shown_name(file))
 }
 
 /// Builds a list entry of one image (camera, time, split, path) from `own`, the JSON object of this image in a
@@ -86,8 +86,8 @@ fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
 
 /// Reads the `cameras.json` of a 3DGS model folder, a list of `count` cameras.
 pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
-    let mut assembly = Assembly::new(options.memory);
-    assembly.begin(file, count)?;
+    let mut builder = RigBuilder::new(options.memory);
+    builder.begin(file, count)?;
     let mut origin = shown_name(file);
     let mut times = Vec::new();
     if options.times != TimesSource::Own {
@@ -97,19 +97,19 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
                 Some(SmallValue::Text(name)) => name.clone(),
                 _ => "".into(),
             };
-            assembly.memory_counter().take(file, &place(Some(index)), "the names of images", name.len() as u64 + 96)?;
+            builder.memory_counter().take(file, &place(Some(index)), "the names of images", name.len() as u64 + 96)?;
             names.push(name);
             Ok(())
         })?;
-        let (given, source) = times::resolve(file, &names, &options.times, assembly.memory_counter())?;
+        let (given, source) = times::resolve(file, &names, &options.times, builder.memory_counter())?;
         origin += &format!(" ({source})");
         times = given;
     }
     each_image(file, None, &CAMERA_KEYS, |index, camera| {
         let time = times.get(index).copied().flatten();
-        assembly.add(ListedImage { time, ..per_camera(file, CameraFields::new(file, Some(index), camera)?)? })
+        builder.add(ListedImage { time, ..per_camera(file, CameraFields::new(file, Some(index), camera)?)? })
     })?;
-    assembly.finish(None, origin)
+    builder.finish(None, origin)
 }
 
 /// Builds a list entry of one image from `own`, the JSON object of one camera in a `cameras.json` of 3DGS. The list

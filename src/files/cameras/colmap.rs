@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
-use super::assemble::{Assembly, ListedImage, MemoryCounter};
+use super::assemble::{ListedImage, MemoryCounter, RigBuilder};
 use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX, TimesSource, frames, times};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
@@ -79,8 +79,8 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     let binary = folder.join("cameras.bin").is_file();
     let file = |name: &str| folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" }));
     let (cameras, images) = (file("cameras"), file("images"));
-    let mut assembly = Assembly::new(options.memory);
-    let counter = assembly.memory_counter();
+    let mut builder = RigBuilder::new(options.memory);
+    let counter = builder.memory_counter();
     let lenses = if binary { read_cameras(&cameras, counter)? } else { parse_cameras(&cameras, counter)? };
     let mut listed = if binary { read_images(&images, counter)? } else { parse_images(&images, counter)? };
     // Sort by name, because COLMAP lists images in the order in which it registered them.
@@ -128,19 +128,19 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
         }
         let origin = format!("{} (each of {frames} frames)", shown_name(&folder));
         let first_frame = listed.iter().map(listed_image).collect::<Result<Vec<_>>>()?;
-        assembly.begin(&images, listed.len() * frames)?;
-        frames::repeat_for_frames(&first_frame, &first, frames).try_for_each(|image| assembly.add(image))?;
-        return assembly.finish(None, origin);
+        builder.begin(&images, listed.len() * frames)?;
+        frames::repeat_for_frames(&first_frame, &first, frames).try_for_each(|image| builder.add(image))?;
+        return builder.finish(None, origin);
     }
     let names: Vec<Box<str>> = listed.iter().map(|image| image.name.clone()).collect();
-    let (given, source) = times::resolve(&images, &names, &options.times, assembly.memory_counter())?;
-    assembly.begin(&images, listed.len())?;
+    let (given, source) = times::resolve(&images, &names, &options.times, builder.memory_counter())?;
+    builder.begin(&images, listed.len())?;
     for (index, image) in listed.iter().enumerate() {
-        assembly.add(ListedImage { time: given.get(index).copied().flatten(), ..listed_image(image)? })?;
+        builder.add(ListedImage { time: given.get(index).copied().flatten(), ..listed_image(image)? })?;
     }
     let origin = shown_name(&folder);
     let origin = if source.is_empty() { origin } else { format!("{origin} ({source})") };
-    assembly.finish(None, origin)
+    builder.finish(None, origin)
 }
 
 /// Returns the folder that holds the COLMAP files. `found` is a folder or a file in a folder; the result is this folder

@@ -12,7 +12,7 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 use npyz::{NpyFile, Order, TypeChar};
 
-use super::assemble::{Assembly, ListedImage, MemoryCounter, check, from_camera_to_world};
+use super::assemble::{ListedImage, MemoryCounter, RigBuilder, check, from_camera_to_world};
 use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX};
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
@@ -32,8 +32,8 @@ const DEFAULT_FRAMES: usize = 300;
 /// Fails if the array or a camera is malformed, or if the number of cameras times the number of frames exceeds the
 /// maximum number of images.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
-    let mut assembly = Assembly::new(options.memory);
-    let rows = read_rows(file, assembly.memory_counter())?;
+    let mut builder = RigBuilder::new(options.memory);
+    let rows = read_rows(file, builder.memory_counter())?;
     let cameras =
         rows.iter().enumerate().map(|(index, row)| camera(file, index, row, options)).collect::<Result<Vec<_>>>()?;
     let frames = options.frames.unwrap_or(DEFAULT_FRAMES);
@@ -48,9 +48,9 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     if options.frames.is_none() {
         origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
     }
-    assembly.begin(file, frames * cameras.len())?;
-    listed_images(&cameras, frames).try_for_each(|image| assembly.add(image))?;
-    assembly.finish(None, origin)
+    builder.begin(file, frames * cameras.len())?;
+    listed_images(&cameras, frames).try_for_each(|image| builder.add(image))?;
+    builder.finish(None, origin)
 }
 
 /// Returns one image for each of `cameras` at each of `frames` frames, ordered by frame, then by camera.

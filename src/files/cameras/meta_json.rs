@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
-use super::assemble::{Assembly, ListedImage};
+use super::assemble::{ListedImage, RigBuilder};
 use super::fields::{CameraFields, POSE, place};
 use super::image_list::outline;
 use crate::error::ShowPath;
@@ -39,19 +39,19 @@ pub(super) fn is_meta_json(outline: &SmallValue) -> bool {
 /// of frames.
 pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<Rig> {
     let split = |path: &Path| FILES.iter().find(|(name, _)| path.ends_with(name)).map_or(Split::Train, |found| found.1);
-    let mut assembly = Assembly::new(memory);
-    let frames = add_file(&mut assembly, file, split(file))?;
+    let mut builder = RigBuilder::new(memory);
+    let frames = add_file(&mut builder, file, split(file))?;
     for (name, split) in FILES.iter().filter(|(name, _)| with_others && !file.ends_with(name)) {
         let other = file.with_file_name(name);
         if other.is_file() {
-            let found = add_file(&mut assembly, &other, *split)?;
+            let found = add_file(&mut builder, &other, *split)?;
             if found != frames {
                 let expected = format!("{frames} frames, as in {}", file.shown());
                 return Err(Error::input(&other, "k", expected, format!("{found} frames")));
             }
         }
     }
-    assembly.finish(None, shown_name(file))
+    builder.finish(None, shown_name(file))
 }
 
 /// Values of one of the [`KEYS`] in a camera file, by frame and camera. The values of all frames are in one list;
@@ -126,8 +126,8 @@ impl Tables {
     }
 }
 
-/// Adds the images that `file` lists to `assembly`, as images of `split`. Returns the number of frames of the file.
-fn add_file(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
+/// Adds the images that `file` lists to `builder`, as images of `split`. Returns the number of frames of the file.
+fn add_file(builder: &mut RigBuilder, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
     let (width, height) = (shared.side("w")?, shared.side("h")?);
@@ -153,7 +153,7 @@ fn add_file(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize>
         }
         let text = if let SmallValue::Text(text) = &value { text.len() as u64 } else { 0 };
         let taken = if inner.is_some() { bytes[key] + text } else { 3 * size_of::<usize>() as u64 };
-        assembly.memory_counter().take(file, &place(Some(index)), "its cameras", taken)?;
+        builder.memory_counter().take(file, &place(Some(index)), "its cameras", taken)?;
         used += taken;
         if inner.is_some() {
             let entry = SmallValue::from_entry(name, value);
@@ -175,14 +175,14 @@ fn add_file(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize>
         Ok(())
     })?;
     let Tables { intrinsics, poses, images, views } = tables;
-    assembly.begin(file, intrinsics.values.len())?;
+    builder.begin(file, intrinsics.values.len())?;
     for frame in 0..intrinsics.ends.len() {
         for camera in 0..intrinsics.len(frame) {
             let nothing = || Error::input(file, format!("frame {frame}, key \"w2c\""), POSE, "nothing");
             let [fx, fy, cx, cy] = *intrinsics.get(frame, camera).expect("a matrix for every camera");
             let &(rotation, translation) = poses.get(frame, camera).ok_or_else(nothing)?;
             let image = images.get(frame, camera).map(|name| PathBuf::from("ims").join(&**name));
-            assembly.add(ListedImage {
+            builder.add(ListedImage {
                 camera: Camera { width, height, fx, fy, cx, cy, rotation, translation, near: Camera::NEAR },
                 time: Some(frame as f64 / frames.saturating_sub(1).max(1) as f64),
                 split,
@@ -191,6 +191,6 @@ fn add_file(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize>
             })?;
         }
     }
-    assembly.memory_counter().release(used);
+    builder.memory_counter().release(used);
     Ok(frames)
 }

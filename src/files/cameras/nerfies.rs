@@ -16,7 +16,7 @@ use std::path::Path;
 use hashbrown::{HashMap, HashSet};
 
 use super::CameraOptions;
-use super::assemble::{Assembly, ListedImage, MemoryCounter, from_camera_to_world};
+use super::assemble::{ListedImage, MemoryCounter, RigBuilder, from_camera_to_world};
 use super::fields::CameraFields;
 use super::image_list::read_keys;
 use crate::error::{Error, Result, quoted};
@@ -38,13 +38,13 @@ const TRAIN_EVERY: usize = 4;
 /// Fails if a file is missing or malformed, or if an image has no camera or no time.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let folder = file.parent().unwrap_or(Path::new(""));
-    let mut assembly = Assembly::new(options.memory);
-    let [ids, val, train] = names(file, assembly.memory_counter())?;
+    let mut builder = RigBuilder::new(options.memory);
+    let [ids, val, train] = names(file, builder.memory_counter())?;
     let splits = splits(&ids, &val, &train);
     let metadata = folder.join("metadata.json");
-    let warps = warps(&metadata, &ids, assembly.memory_counter())?;
+    let warps = warps(&metadata, &ids, builder.memory_counter())?;
     let latest = f64::from(warps.iter().copied().max().unwrap_or(0).max(1));
-    assembly.begin(file, splits.iter().map(Vec::len).sum())?;
+    builder.begin(file, splits.iter().map(Vec::len).sum())?;
     for ((id, warp), splits) in ids.iter().zip(warps).zip(splits) {
         if splits.is_empty() {
             continue;
@@ -52,10 +52,10 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
         let listed = listed_image(folder, id, options)?;
         for split in splits {
             let time = f64::from(warp) / latest;
-            assembly.add(ListedImage { time: Some(time), split, ..listed.clone() })?;
+            builder.add(ListedImage { time: Some(time), split, ..listed.clone() })?;
         }
     }
-    assembly.finish(None, shown_name(folder))
+    builder.finish(None, shown_name(folder))
 }
 
 /// Keys in `dataset.json` of the lists of image names: all images, test images, training images.

@@ -93,7 +93,7 @@ fn negative_zero_and_zero_give_the_same_camera() {
                "w2c": [[1, zero, zero, zero], [0, 1, zero, 0], [0, 0, 1, 3], [0, 0, 0, 1]]})
     };
     let rig = load_json("cameras.json", &json!({"frames": [frame(0.0, 0.0), frame(-0.0, 0.5), frame(1e-300, 1.0)]}));
-    let cameras: Vec<u32> = rig.unwrap().shots.iter().map(|shot| shot.camera).collect();
+    let cameras: Vec<u32> = rig.unwrap().views.iter().map(|rig_view| rig_view.camera).collect();
     assert_eq!(cameras, [0, 0, 1]);
 }
 
@@ -106,7 +106,7 @@ fn transforms_and_cameras_json_give_the_same_cameras() {
         let cameras = load(&model.join("cameras.json"), &options).unwrap();
         for rig in [&transforms, &cameras] {
             assert_eq!(rig.cameras.len(), 16, "{}", rig.origin);
-            let count = |split| rig.shots.iter().filter(|shot| shot.split == split).count();
+            let count = |split| rig.views.iter().filter(|rig_view| rig_view.split == split).count();
             assert_eq!((count(Split::Train), count(Split::Test)), (13 * 60, 3 * 60));
             let times = rig.times();
             assert_eq!(times.len(), 60);
@@ -114,17 +114,17 @@ fn transforms_and_cameras_json_give_the_same_cameras() {
             assert!(schedule.iter().all(|views| views.len() == 16));
         }
         assert!(transforms.background.is_none() && cameras.background.is_some());
-        for shot in &cameras.shots {
-            let same = transforms.shots.iter().find(|s| s.view == shot.view && s.time == shot.time).unwrap();
-            assert_eq!(same.split, shot.split);
-            let (a, b) = (&transforms.cameras[same.camera as usize], &cameras.cameras[shot.camera as usize]);
+        for rig_view in &cameras.views {
+            let same = transforms.views.iter().find(|s| s.view == rig_view.view && s.time == rig_view.time).unwrap();
+            assert_eq!(same.split, rig_view.split);
+            let (a, b) = (&transforms.cameras[same.camera as usize], &cameras.cameras[rig_view.camera as usize]);
             let turned = (a.rotation - b.rotation).to_cols_array().into_iter().fold(0.0, |m: f64, x| m.max(x.abs()));
             let moved = (a.center() - b.center()).length();
-            assert!(turned <= 1e-9 && moved <= 1e-9, "view {}: {turned:e} {moved:e}", shot.view);
+            assert!(turned <= 1e-9 && moved <= 1e-9, "view {}: {turned:e} {moved:e}", rig_view.view);
             assert_eq!((a.width, a.height, a.fx, a.fy), (b.width, b.height, b.fx, b.fy));
             assert_eq!((a.cx, a.cy), (b.cx, b.cy));
         }
-        let there = transforms.shots.iter().filter(|s| s.image.as_ref().is_some_and(|image| image.is_file())).count();
+        let there = transforms.views.iter().filter(|s| s.image.as_ref().is_some_and(|image| image.is_file())).count();
         assert_eq!(there, fs::read_dir(model.join("test")).unwrap().count(), "every image of test/ is found");
     }
 }
@@ -137,14 +137,15 @@ fn a_folder_gives_all_splits_and_a_file_one() {
     ]);
     let options = CameraOptions::default();
     let whole = load(folder.path(), &options).unwrap();
-    assert_eq!(whole.shots.len(), 4);
-    assert_eq!(whole.shots.iter().map(|s| s.split == Split::Test).collect::<Vec<_>>(), [false, false, false, true]);
+    assert_eq!(whole.views.len(), 4);
+    assert_eq!(whole.views.iter().map(|s| s.split == Split::Test).collect::<Vec<_>>(), [false, false, false, true]);
     // If the user names a file of one split, only its images are loaded, but their times are those they have among all
     // splits.
     let alone = |name: &str| load(&folder.path().join(name), &options).unwrap();
     for (name, split) in [("transforms_train.json", Split::Train), ("transforms_test.json", Split::Test)] {
-        let own: Vec<_> = whole.shots.iter().filter(|shot| shot.split == split).map(|shot| shot.time).collect();
-        let found: Vec<_> = alone(name).shots.iter().map(|shot| (shot.split, shot.time)).collect();
+        let own: Vec<_> =
+            whole.views.iter().filter(|rig_view| rig_view.split == split).map(|rig_view| rig_view.time).collect();
+        let found: Vec<_> = alone(name).views.iter().map(|rig_view| (rig_view.split, rig_view.time)).collect();
         assert_eq!(found, own.into_iter().map(|time| (split, time)).collect::<Vec<_>>(), "{name}");
     }
 }
@@ -155,7 +156,7 @@ fn val_is_held_out_if_there_is_no_test_split() {
     let val = transforms(&[0.25, 0.75]);
     let files = [("transforms_train.json", &train), ("transforms_val.json", &val)];
     let rig = load(folder(&files).path(), &CameraOptions::default()).unwrap();
-    let count = |rig: &Rig, split| rig.shots.iter().filter(|shot| shot.split == split).count();
+    let count = |rig: &Rig, split| rig.views.iter().filter(|rig_view| rig_view.split == split).count();
     assert_eq!((count(&rig, Split::Train), count(&rig, Split::Val), count(&rig, Split::Test)), (3, 2, 0));
     assert_eq!(rig.held_out_split(), Some(Split::Val));
     let test = transforms(&[0.6]);
@@ -198,15 +199,15 @@ fn nerfies_cameras_match_the_4dgaussians_loader() {
     );
     assert_eq!(camera.rotation * DVec3::Z, DVec3::X);
     assert!((rig.cameras[1].center() - DVec3::new(2.0, 5.0, 6.0)).length() < 1e-12, "{}", rig.cameras[1].center());
-    let shots: Vec<_> = rig.shots.iter().map(|shot| (shot.time.unwrap(), shot.split)).collect();
+    let rig_views: Vec<_> = rig.views.iter().map(|rig_view| (rig_view.time.unwrap(), rig_view.split)).collect();
     let at = |k: usize| k as f64 / 9.0;
     // Every fourth image is for training; the image two after it is for testing, except after the last training image.
     let expected = [(0, Split::Train), (2, Split::Test), (4, Split::Train), (6, Split::Test), (8, Split::Train)];
-    assert_eq!(shots, expected.map(|(k, split)| (at(k), split)));
+    assert_eq!(rig_views, expected.map(|(k, split)| (at(k), split)));
     write("dataset.json", json!({"ids": ids, "val_ids": [ids[3]], "train_ids": [ids[0], ids[1]]}));
     let rig = load(&folder.path().join("dataset.json"), &CameraOptions::default()).unwrap();
-    let shots: Vec<_> = rig.shots.iter().map(|shot| (shot.time.unwrap(), shot.split)).collect();
-    assert_eq!(shots, [(at(0), Split::Train), (at(1), Split::Train), (at(3), Split::Test)]);
+    let rig_views: Vec<_> = rig.views.iter().map(|rig_view| (rig_view.time.unwrap(), rig_view.split)).collect();
+    assert_eq!(rig_views, [(at(0), Split::Train), (at(1), Split::Train), (at(3), Split::Test)]);
     write("camera/000001.json", json!({"orientation": 3}));
     let message = load(folder.path(), &CameraOptions::default()).unwrap_err().to_string();
     assert!(message.contains("000001.json") && message.contains("image_size"), "{message}");
@@ -277,7 +278,7 @@ fn missing_size_comes_from_the_image_then_the_option() {
     fs::write(folder.path().join("train/r_000.png"), png).unwrap();
     let rig = load(folder.path(), &options).unwrap();
     assert_eq!((rig.cameras[0].width, rig.cameras[0].height), (256, 200));
-    assert_eq!(rig.shots[0].image, Some(folder.path().join("train/r_000.png")));
+    assert_eq!(rig.views[0].image, Some(folder.path().join("train/r_000.png")));
 }
 
 #[test]
@@ -287,7 +288,7 @@ fn views_are_numbered_by_name_or_by_pose() {
         document["frames"][i]["file_path"] = json!(name);
     }
     let views = |document: &Value| -> Vec<u32> {
-        load_json("transforms.json", document).unwrap().shots.iter().map(|shot| shot.view).collect()
+        load_json("transforms.json", document).unwrap().views.iter().map(|rig_view| rig_view.view).collect()
     };
     assert_eq!(views(&document), [7, 3]);
     document["frames"][1]["file_path"] = json!("./train/cat_v03");
@@ -304,7 +305,7 @@ fn own_cameras_json_is_read_completely() {
     let Camera { fx, fy, cx, cy, translation, .. } = rig.cameras[0];
     assert_eq!((fx, fy, cx, cy, translation), (70.0, 71.0, 39.0, 31.0, DVec3::new(0.5, 0.0, 3.0)));
     assert_eq!(rig.times(), [0.0, 0.25], "times are taken as they are");
-    assert!(rig.shots.iter().all(|shot| shot.view == 4 && shot.split == Split::Train));
+    assert!(rig.views.iter().all(|rig_view| rig_view.view == 4 && rig_view.split == Split::Train));
 }
 
 #[test]
@@ -314,7 +315,7 @@ fn cameras_of_a_3dgs_folder_see_every_frame() {
                "position": [x, 0.0, -3.0], "rotation": [[0, 0, 1], [1, 0, 0], [0, 1, 0]]})
     };
     let rig = load_json("cameras.json", &json!([entry(0, 1.0), entry(1, 2.0), entry(2, 1.0)])).unwrap();
-    assert_eq!((rig.cameras.len(), rig.shots.len()), (2, 2), "the third repeats the first");
+    assert_eq!((rig.cameras.len(), rig.views.len()), (2, 2), "the third repeats the first");
     assert_eq!(rig.cameras[0].center(), DVec3::new(1.0, 0.0, -3.0));
     // The camera-to-world rotation maps forward (z) to the world's x, so world x must map to forward.
     assert_eq!(rig.cameras[0].rotation * DVec3::X, DVec3::Z);

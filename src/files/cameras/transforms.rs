@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
-use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
+use super::assemble::{ListedImage, RigBuilder, from_camera_to_world, view_in_name};
 use super::fields::CameraFields;
 use super::image_list::{each_image, outline};
 use super::{CameraOptions, TimeConvention};
@@ -46,16 +46,16 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
         }
     }
     files.sort_by_key(|file| split_of(file) as u8);
-    let mut assembly = Assembly::new(options.memory);
+    let mut builder = RigBuilder::new(options.memory);
     for file in &files {
-        add_file(&mut assembly, file, options)?;
+        add_file(&mut builder, file, options)?;
     }
-    let latest = assembly.latest(latest);
+    let latest = builder.latest(latest);
     if latest > 0.0 && options.clock == TimeConvention::Normalized {
-        assembly.divide_times(latest);
+        builder.divide_times(latest);
     }
     let names: Vec<String> = files.iter().map(|path| shown_name(path)).collect();
-    assembly.finish(None, names.join(" and "))
+    builder.finish(None, names.join(" and "))
 }
 
 /// Returns the split named in a file name (train, val or test); training if the name contains none.
@@ -92,14 +92,14 @@ fn latest_in(file: &Path) -> Result<f64> {
     Ok(latest)
 }
 
-/// Adds the images listed in `file` to `assembly`.
-fn add_file(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
+/// Adds the images listed in `file` to `builder`.
+fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
-    assembly.begin(file, shared.list_len("frames")?)?;
+    builder.begin(file, shared.list_len("frames")?)?;
     let split = split_of(file);
     each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
-        assembly.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
+        builder.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
     })
 }
 

@@ -3,7 +3,7 @@
 
 use glam::DVec3;
 
-use crate::model::{Camera, Rig, Shot, Split};
+use crate::model::{Camera, Rig, RigView, Split};
 
 /// Number of cameras around a moving scene. The static models in docs/benchmarks.md are scored with the same number of
 /// cameras.
@@ -33,10 +33,10 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
         let (eye, angle) = (center + radius * on_sphere(k, CAMERAS), FIELD_OF_VIEW_DEGREES.to_radians());
         Camera { near: NEAR * extent, ..Camera::look_at(eye, center, angle, (SIDE_PX, SIDE_PX)) }
     });
-    let shot = |view| Shot { view, camera: view, time: None, split: Split::Train, image: None };
+    let rig_view = |view| RigView { view, camera: view, time: None, split: Split::Train, image: None };
     Rig {
         cameras: cameras.collect(),
-        shots: (0..CAMERAS).map(shot).collect(),
+        views: (0..CAMERAS).map(rig_view).collect(),
         background: None,
         origin: format!(
             "virtual rig: {CAMERAS} cameras on a Fibonacci sphere of radius {radius:.6} around ({:.6}, {:.6}, {:.6}), \
@@ -106,10 +106,10 @@ pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
         );
         Camera { near: NEAR * radius, ..camera }
     };
-    let shot = |view| Shot { view, camera: view, time: None, split: Split::Train, image: None };
+    let rig_view = |view| RigView { view, camera: view, time: None, split: Split::Train, image: None };
     Rig {
         cameras: (0..SURROUNDING_CAMERAS).map(camera).collect(),
-        shots: (0..SURROUNDING_CAMERAS).map(shot).collect(),
+        views: (0..SURROUNDING_CAMERAS).map(rig_view).collect(),
         background: None,
         origin: format!(
             "virtual rig: {SURROUNDING_CAMERAS} cameras on a Fibonacci sphere of radius {distance:.6} around the \

@@ -11,7 +11,7 @@ use gseq::{Reader, TileBuffer, TileFrames, TileId, TouchedPages};
 use super::held::HeldTiles;
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
-use crate::model::{Attributes, MAX_SH_DEGREE, SequenceInfo, sh_coefficients};
+use crate::model::{Attributes, MAX_SH_DEGREE, SequenceInfo, sh_coefficient_count};
 use crate::source::SharedCounter;
 
 /// Open container file with one column for each attribute of Gaussians.
@@ -73,7 +73,7 @@ impl Container {
             let legal = match column {
                 Attributes::ROTATION => width == 4,
                 Attributes::OPACITY => width == 1,
-                Attributes::SH => (0..=MAX_SH_DEGREE).any(|degree| width == 3 * sh_coefficients(degree)),
+                Attributes::SH => (0..=MAX_SH_DEGREE).any(|degree| width == 3 * sh_coefficient_count(degree)),
                 _ => width == 3,
             };
             if !legal {
@@ -86,7 +86,7 @@ impl Container {
                 ));
             }
             if column == Attributes::SH {
-                sh_degree = (0..=MAX_SH_DEGREE).find(|&degree| width == 3 * sh_coefficients(degree)).unwrap_or(0);
+                sh_degree = (0..=MAX_SH_DEGREE).find(|&degree| width == 3 * sh_coefficient_count(degree)).unwrap_or(0);
             }
             places.push((column, place));
         }
@@ -96,7 +96,7 @@ impl Container {
             .ok_or_else(|| Error::input(path, "header", "fewer than 2^32 Gaussians", layout.gaussians.to_string()))?;
         let mut varying = Attributes::empty();
         for &(column, place) in &places {
-            if reader.varies(place) {
+            if reader.is_varying(place) {
                 varying |= column;
             }
         }

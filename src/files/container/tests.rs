@@ -57,7 +57,7 @@ impl EncodingSource {
     fn expected(&self, ids: &Ids<'_>, frame: usize, want: Attributes) -> Gaussians {
         let mut out = Gaussians::zeros(0, 1);
         for column in want.iter() {
-            let to = out.column_mut(column);
+            let to = out.attribute_values_mut(column);
             to.resize(ids.len());
             for c in 0..to.width() {
                 to.plane_mut(c)
@@ -85,7 +85,7 @@ struct EncodingReader<'a>(&'a EncodingSource, Vec<u32>);
 impl BlockReader for EncodingReader<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let source = self.0.expected(&Ids::List(&self.1), frame, want);
-        want.iter().for_each(|column| *out.column_mut(column) = source.column(column).clone());
+        want.iter().for_each(|column| *out.attribute_values_mut(column) = source.attribute_values(column).clone());
         Ok(())
     }
 }
@@ -201,9 +201,9 @@ fn a_scan_reads_each_stored_byte_once() {
     let source = EncodingSource::new();
     for compression in [Compression::Zstd(1), Compression::Raw] {
         let (_folder, container) = source.pack(compression);
-        assert_eq!(container.reads(), Reads::default());
+        assert_eq!(container.reads(), ReadCounts::default());
         let (tiles, bytes) = all_tiles(&container);
-        let once = Reads { bytes, tiles, states: (COUNT * FRAMES) as u64 };
+        let once = ReadCounts { bytes, tiles, states: (COUNT * FRAMES) as u64 };
         scan(&source, &container);
         assert_eq!(container.reads(), once, "{compression:?}");
         // The first scan has verified the raw (uncompressed) tiles. A second scan must read the same bytes again.

@@ -368,7 +368,7 @@ impl BlockReader for TileReader<'_> {
             if !want.contains(column) {
                 continue;
             }
-            let target = out.column_mut(column);
+            let target = out.attribute_values_mut(column);
             target.resize(self.len);
             if self.len > 0 {
                 self.read_column(index, frame, target.planes_mut())?;

@@ -2,7 +2,7 @@
 //! before each frame and at the end (format/STREAM.md).
 
 use crate::error::quoted;
-use crate::model::{Attributes, sh_coefficients};
+use crate::model::{Attributes, sh_coefficient_count};
 
 /// Versions of the stream format. In version 1 every frame has the same Gaussians, in version 2 every frame states
 /// their number.
@@ -232,4 +232,4 @@ fn u64_at(bytes: &[u8], at: usize) -> u64 {
 }
 
 /// Compile-time check that the number of bytes of a frame fits into `u64` for every legal header.
-const _: () = assert!((u32::MAX as u64).checked_mul(4 * (11 + 3 * sh_coefficients(3)) as u64).is_some());
+const _: () = assert!((u32::MAX as u64).checked_mul(4 * (11 + 3 * sh_coefficient_count(3)) as u64).is_some());

@@ -65,7 +65,7 @@ impl<R: Read> FrameStream<R> {
         let announced = 4 * columns.width(header.sh_degree) as u64 * header.count as u64;
         memory.check(name, "byte 16", &format!("the constant columns of {} Gaussians", header.count), announced)?;
         for column in columns.iter() {
-            if !bytes.read_attribute(header.count, constant.column_mut(column))? {
+            if !bytes.read_attribute(header.count, constant.attribute_values_mut(column))? {
                 return Err(bytes.ended(&format!("the constant column {}", column.name()), None));
             }
         }
@@ -121,7 +121,7 @@ impl<R: Read> FrameStream<R> {
             false => self.header.count,
         };
         for column in self.header.varying.iter() {
-            if !self.bytes.read_attribute(count, out.column_mut(column))? {
+            if !self.bytes.read_attribute(count, out.attribute_values_mut(column))? {
                 let expected = format!("the rest of frame {frame} (column {})", column.name());
                 return Err(self.bytes.ended(&expected, Some(frame)));
             }

@@ -10,7 +10,7 @@ use crate::error::{Error, Result, quoted};
 use crate::files::json::{ParseAbort, read_from};
 use crate::files::map::FileMap;
 use crate::limits::ReadLimit;
-use crate::model::{Gaussians, MAX_SH_DEGREE, logit, sh_coefficients};
+use crate::model::{Gaussians, MAX_SH_DEGREE, logit, sh_coefficient_count};
 
 /// Maximum length in bytes of the JSON text; the text of our own files takes 5 kB.
 const MAX_TEXT_BYTES: usize = 1 << 20;
@@ -92,15 +92,16 @@ pub fn read_glb(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     if u32::try_from(count).is_err() {
         return Err(Error::input(path, "POSITION", "at most 4294967295 Gaussians", count.to_string()));
     }
-    let decoded = 4 * (11 + 3 * sh_coefficients(MAX_SH_DEGREE) as u64);
+    let decoded = 4 * (11 + 3 * sh_coefficient_count(MAX_SH_DEGREE) as u64);
     memory.check(path, "POSITION", "the Gaussians of the file", count as u64 * decoded)?;
     let [rotation, scale, opacity] =
         [("ROTATION", "VEC4"), ("SCALE", "VEC3"), ("OPACITY", "SCALAR")].map(|(name, kind)| of_extension(name, kind));
     let (rotation, scale, opacity) = (rotation?, scale?, opacity?);
     let has = |k: usize| !primitive["attributes"][&sh_attribute(k)].is_null();
-    let degree = (1..=MAX_SH_DEGREE).rev().find(|&degree| has(sh_coefficients(degree) - 1)).unwrap_or(0);
-    let sh =
-        (0..sh_coefficients(degree)).map(|k| accessor(&sh_attribute(k), "VEC3")).collect::<Result<Vec<Accessor>>>()?;
+    let degree = (1..=MAX_SH_DEGREE).rev().find(|&degree| has(sh_coefficient_count(degree) - 1)).unwrap_or(0);
+    let sh = (0..sh_coefficient_count(degree))
+        .map(|k| accessor(&sh_attribute(k), "VEC3"))
+        .collect::<Result<Vec<Accessor>>>()?;
     for (found, name) in [(&rotation, "ROTATION"), (&scale, "SCALE"), (&opacity, "OPACITY")]
         .into_iter()
         .chain(sh.iter().map(|found| (found, "an SH coefficient")))

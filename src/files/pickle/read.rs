@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use hashbrown::HashMap;
 
-use super::{MAX_DEPTH, Node, NodeId, Pickle, Wrong};
+use super::{MAX_DEPTH, Node, NodeId, Pickle, PickleError};
 
 /// Maximum number of instructions in a pickle. One tensor takes about 35, so this is enough for 50,000 tensors.
 const MAX_INSTRUCTIONS: u32 = 1 << 21;
@@ -26,10 +26,10 @@ struct AllocationCounter {
 impl AllocationCounter {
     /// Counts `bytes` bytes of memory that are about to be allocated. Fails if the memory limit would be exceeded; the
     /// error names the byte `at` of the pickle.
-    fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
+    fn take(&mut self, bytes: usize, at: usize) -> Result<(), PickleError> {
         let taken = self.taken.saturating_add(bytes as u64);
         if taken > self.limit {
-            return Err(Wrong::Memory(at, taken));
+            return Err(PickleError::Memory(at, taken));
         }
         self.taken = taken;
         Ok(())
@@ -37,7 +37,7 @@ impl AllocationCounter {
 
     /// Reserves memory for `more` elements of `list`. Fails if the memory limit would be exceeded; the error names the
     /// byte `at` of the pickle. While the list grows, the old and the new buffer exist together; both are counted.
-    fn reserve<T>(&mut self, list: &mut Vec<T>, more: usize, at: usize) -> Result<(), Wrong> {
+    fn reserve<T>(&mut self, list: &mut Vec<T>, more: usize, at: usize) -> Result<(), PickleError> {
         let (needed, old) = (list.len() + more, list.capacity());
         if needed > old {
             let capacity = needed.max(2 * old).max(4);
@@ -89,7 +89,7 @@ impl<'a> PickleMachine<'a> {
     ///
     /// # Errors
     /// Fails at the first instruction that is malformed or exceeds a limit.
-    pub(super) fn read(mut self) -> Result<Pickle, Wrong> {
+    pub(super) fn read(mut self) -> Result<Pickle, PickleError> {
         loop {
             if let Some(root) = self.step()? {
                 return Ok(Pickle { nodes: self.nodes, root, frames: self.frames });
@@ -98,7 +98,7 @@ impl<'a> PickleMachine<'a> {
     }
 
     /// Executes the next instruction. Returns the root node of the object tree after the last instruction, else `None`.
-    fn step(&mut self) -> Result<Option<NodeId>, Wrong> {
+    fn step(&mut self) -> Result<Option<NodeId>, PickleError> {
         let start = self.at;
         self.count_instruction(start)?;
         let [instruction] = self.take_bytes()?;
@@ -127,9 +127,8 @@ impl<'a> PickleMachine<'a> {
                 self.collect(first, Node::Tuple)?;
             }
             0x85..=0x87 => {
-                let first = self.stack.len().checked_sub(usize::from(instruction - 0x84));
-                let first = first.filter(|&first| first >= self.floor());
-                self.collect(first.ok_or(Wrong::at(start, "a tuple of more values than there are"))?, Node::Tuple)?;
+                let first = self.tuple_start(usize::from(instruction - 0x84), start)?;
+                self.collect(first, Node::Tuple)?;
             }
             b'l' | 0x91 => {
                 let first = self.unmark()?;
@@ -190,18 +189,25 @@ impl<'a> PickleMachine<'a> {
         Ok(None)
     }
 
+    /// Returns the index on the stack of the first value of a tuple that takes the top `count` values. Fails if there are
+    /// fewer values above the last mark. `start`: byte at which the instruction begins.
+    fn tuple_start(&self, count: usize, start: usize) -> Result<usize, PickleError> {
+        let first = self.stack.len().checked_sub(count).filter(|&first| first >= self.floor());
+        first.ok_or(PickleError::at(start, "a tuple of more values than there are"))
+    }
+
     /// Counts one instruction, which begins at byte `start`. Fails if there are more than [`MAX_INSTRUCTIONS`].
-    fn count_instruction(&mut self, start: usize) -> Result<(), Wrong> {
+    fn count_instruction(&mut self, start: usize) -> Result<(), PickleError> {
         self.instructions += 1;
         if self.instructions > MAX_INSTRUCTIONS {
-            return Err(Wrong::TooMuch(start, format!("at most {MAX_INSTRUCTIONS} instructions"), "more".into()));
+            return Err(PickleError::TooMuch(start, format!("at most {MAX_INSTRUCTIONS} instructions"), "more".into()));
         }
         Ok(())
     }
 
     /// Executes the instruction `instruction`, which was read at byte `start`, if it pushes a value that contains no
     /// other values: a number, a text, bytes, a boolean or `None`. Fails for all other instructions.
-    fn step_scalar(&mut self, instruction: u8, start: usize) -> Result<(), Wrong> {
+    fn step_scalar(&mut self, instruction: u8, start: usize) -> Result<(), PickleError> {
         match instruction {
             b'N' => self.push(Node::None, 0)?,
             0x88 => self.push(Node::Bool(true), 0)?,
@@ -230,14 +236,14 @@ impl<'a> PickleMachine<'a> {
             b'B' | b'T' => self.blob(4)?,
             b'C' | b'U' => self.blob(1)?,
             0x8e | 0x96 => self.blob(8)?,
-            other => return Err(Wrong::at(start, format!("instruction {other:#04x}"))),
+            other => return Err(PickleError::at(start, format!("instruction {other:#04x}"))),
         }
         Ok(())
     }
 
     /// Adds `node` to the object tree and pushes its index onto the stack. `depth` is the nesting depth of the node, 0
     /// for a scalar.
-    fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
+    fn push(&mut self, node: Node, depth: u8) -> Result<(), PickleError> {
         self.allocations.reserve(&mut self.nodes, 1, self.at)?;
         self.allocations.reserve(&mut self.depths, 1, self.at)?;
         self.allocations.reserve(&mut self.stack, 1, self.at)?;
@@ -249,20 +255,20 @@ impl<'a> PickleMachine<'a> {
 
     /// Adds `node`, an empty container, to the object tree and inserts its index into the stack at index `place`, below
     /// the values that will be added to the container.
-    fn push_below(&mut self, node: Node, place: usize) -> Result<(), Wrong> {
+    fn push_below(&mut self, node: Node, place: usize) -> Result<(), PickleError> {
         self.push(node, 1)?;
         self.stack[place..].rotate_right(1);
         Ok(())
     }
 
     /// Pushes the integer `value` onto the stack, with the byte range of its instruction, which began at byte `start`.
-    fn push_int(&mut self, value: i64, start: usize) -> Result<(), Wrong> {
+    fn push_int(&mut self, value: i64, start: usize) -> Result<(), PickleError> {
         self.push(Node::Int(value, start as u32..self.at as u32), 0)
     }
 
     /// Returns the nesting depth of a new container whose elements are `nodes`: one more than the largest depth among
     /// them. Fails if it would exceed [`MAX_DEPTH`].
-    fn container_depth(&self, nodes: impl IntoIterator<Item = NodeId>) -> Result<u8, Wrong> {
+    fn container_depth(&self, nodes: impl IntoIterator<Item = NodeId>) -> Result<u8, PickleError> {
         let deepest = nodes.into_iter().map(|id| self.depths[id as usize]).max().unwrap_or(0);
         match deepest < MAX_DEPTH {
             true => Ok(deepest + 1),
@@ -271,14 +277,14 @@ impl<'a> PickleMachine<'a> {
     }
 
     /// Returns the error for containers that are nested too deep.
-    fn too_deep(&self) -> Wrong {
-        Wrong::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
+    fn too_deep(&self) -> PickleError {
+        PickleError::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
     }
 
     /// Executes the instruction MARK, which began at byte `start`: it opens a container whose elements are pushed next.
     /// Records the present height of the stack as the index of the first element. Fails if too many containers are
     /// open.
-    fn mark(&mut self, start: usize) -> Result<(), Wrong> {
+    fn mark(&mut self, start: usize) -> Result<(), PickleError> {
         if self.marks.len() >= usize::from(MAX_DEPTH) {
             return Err(self.too_deep());
         }
@@ -295,13 +301,13 @@ impl<'a> PickleMachine<'a> {
 
     /// Returns the error for an instruction that needs more values than there are on the stack since the last MARK
     /// (instruction that opens a container).
-    fn missing(&self) -> Wrong {
-        Wrong::at(self.at, "a value that was never given")
+    fn missing(&self) -> PickleError {
+        PickleError::at(self.at, "a value that was never given")
     }
 
     /// Removes the top value of the stack and returns its node. Fails if no value was pushed since the innermost open
     /// container was begun.
-    fn pop(&mut self) -> Result<NodeId, Wrong> {
+    fn pop(&mut self) -> Result<NodeId, PickleError> {
         match self.stack.len() > self.floor() {
             true => Ok(self.stack.pop().expect("there is one")),
             false => Err(self.missing()),
@@ -311,19 +317,19 @@ impl<'a> PickleMachine<'a> {
     /// Returns the stack index of the lowest of the `count` values on top of the stack. Used by instructions that add
     /// these values to a list or dict, which must lie directly below them on the stack. Fails if fewer than `count` + 1
     /// values were pushed since the innermost open container was begun.
-    fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
+    fn beyond_top(&self, count: usize) -> Result<usize, PickleError> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }
 
     /// Closes the innermost open container (the last MARK instruction). Returns the stack index of its first element.
-    fn unmark(&mut self) -> Result<usize, Wrong> {
-        let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of a container that was never begun"))?;
+    fn unmark(&mut self) -> Result<usize, PickleError> {
+        let mark = self.marks.pop().ok_or(PickleError::at(self.at, "the end of a container that was never begun"))?;
         Ok(mark.min(self.stack.len()))
     }
 
     /// Removes the values from stack index `first` up to the top, and pushes one container with these values as
     /// elements. `make` builds the node of the container from the nodes of the elements.
-    fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), Wrong> {
+    fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), PickleError> {
         let depth = self.container_depth(self.stack[first..].iter().copied())?;
         let mut elements = Vec::new();
         if first < self.stack.len() {
@@ -339,7 +345,7 @@ impl<'a> PickleMachine<'a> {
     /// index `first` up to the top, and the container is directly below them on the stack. Sets the nesting depth of
     /// the container to at least one more than the depths of the values. Fails if there is nothing below the values in
     /// the innermost open container, or if the nesting would be too deep.
-    fn container(&mut self, first: usize) -> Result<usize, Wrong> {
+    fn container(&mut self, first: usize) -> Result<usize, PickleError> {
         let below = first.checked_sub(1).filter(|&below| below >= self.floor());
         let top = self.stack[below.ok_or_else(|| self.missing())?] as usize;
         let depth = self.container_depth(self.stack[first..].iter().copied())?;
@@ -351,7 +357,7 @@ impl<'a> PickleMachine<'a> {
     /// removes them from the stack. If there is the result of a call below them (an object with a method `append`), the
     /// values are discarded, because they are not needed. Fails for anything else; the error names byte `start` of the
     /// pickle.
-    fn extend(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
+    fn extend(&mut self, start: usize, first: usize) -> Result<(), PickleError> {
         let top = self.container(first)?;
         match &mut self.nodes[top] {
             Node::List(list) => {
@@ -360,7 +366,7 @@ impl<'a> PickleMachine<'a> {
             }
             // Drop the elements of an object that behaves like a list, because they are not needed.
             Node::Called { .. } => self.stack.truncate(first),
-            _ => return Err(Wrong::at(start, "an element added to a value that is not a list")),
+            _ => return Err(PickleError::at(start, "an element added to a value that is not a list")),
         }
         Ok(())
     }
@@ -369,25 +375,25 @@ impl<'a> PickleMachine<'a> {
     /// them on the stack. Keys and values alternate from stack index `first` up to the top; they are removed from the
     /// stack. Fails if anything else lies below them, or if a key has no value; the error names byte `start` of the
     /// pickle.
-    fn set(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
+    fn set(&mut self, start: usize, first: usize) -> Result<(), PickleError> {
         let top = self.container(first)?;
         let (pairs, rest) = self.stack[first..].as_chunks::<2>();
         if !rest.is_empty() {
-            return Err(Wrong::at(start, "a key without a value"));
+            return Err(PickleError::at(start, "a key without a value"));
         }
         match &mut self.nodes[top] {
             Node::Dict(items) | Node::Called { items, .. } => {
                 self.allocations.reserve(items, pairs.len(), start)?;
                 items.extend(pairs.iter().map(|&[key, value]| (key, value)));
             }
-            _ => return Err(Wrong::at(start, "an item added to a value that is not a dict")),
+            _ => return Err(PickleError::at(start, "an item added to a value that is not a dict")),
         }
         self.stack.truncate(first);
         Ok(())
     }
 
     /// Stores the top value of the stack in the memo (table of nodes for later reference) under `key`.
-    fn store_in_memo(&mut self, key: u32) -> Result<(), Wrong> {
+    fn store_in_memo(&mut self, key: u32) -> Result<(), PickleError> {
         let top = self.stack.last().copied().filter(|_| self.stack.len() > self.floor());
         let top = top.ok_or_else(|| self.missing())?;
         self.allocations.take(MEMO_ENTRY_BYTES, self.at)?;
@@ -397,25 +403,25 @@ impl<'a> PickleMachine<'a> {
 
     /// Pushes the node that is stored in the memo (table of nodes for later reference) under `key`. Fails if there is
     /// none; the error names byte `start` of the pickle.
-    fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
+    fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), PickleError> {
         let known = self.memo.get(&key).copied();
-        let known = known.ok_or_else(|| Wrong::at(start, format!("memo entry {key}, which was never stored")))?;
+        let known = known.ok_or_else(|| PickleError::at(start, format!("memo entry {key}, which was never stored")))?;
         self.allocations.reserve(&mut self.stack, 1, start)?;
         self.stack.push(known);
         Ok(())
     }
 
     /// Reads the next `N` bytes of the pickle.
-    fn take_bytes<const N: usize>(&mut self) -> Result<[u8; N], Wrong> {
+    fn take_bytes<const N: usize>(&mut self) -> Result<[u8; N], PickleError> {
         let taken = self.take_slice(N as u64)?;
         Ok(taken.try_into().expect("as many"))
     }
 
     /// Reads the next `count` bytes of the pickle.
-    fn take_slice(&mut self, count: u64) -> Result<&[u8], Wrong> {
+    fn take_slice(&mut self, count: u64) -> Result<&[u8], PickleError> {
         let left = self.bytes.len() - self.at;
         let count = usize::try_from(count).ok().filter(|&count| count <= left);
-        let count = count.ok_or(Wrong::at(self.at, "the end of the pickle"))?;
+        let count = count.ok_or(PickleError::at(self.at, "the end of the pickle"))?;
         self.at += count;
         Ok(&self.bytes[self.at - count..self.at])
     }
@@ -423,7 +429,7 @@ impl<'a> PickleMachine<'a> {
     /// Reads an integer of any length and pushes it onto the stack. `start` is the byte at which its instruction began.
     /// The pickle holds the number of bytes of the integer first, which takes `length_bytes` bytes, then the integer.
     /// An integer that does not fit into `i64` becomes [`Node::Opaque`].
-    fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), Wrong> {
+    fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), PickleError> {
         let length = self.length(length_bytes)?;
         let digits = self.take_slice(length)?;
         // Ignore a ninth byte of 0, which only keeps the highest bit of the eighth byte from being taken for a sign.
@@ -441,7 +447,7 @@ impl<'a> PickleMachine<'a> {
     }
 
     /// Reads a length that is stored in `bytes` bytes.
-    fn length(&mut self, bytes: usize) -> Result<u64, Wrong> {
+    fn length(&mut self, bytes: usize) -> Result<u64, PickleError> {
         let mut wide = [0; 8];
         wide[..bytes].copy_from_slice(self.take_slice(bytes as u64)?);
         Ok(u64::from_le_bytes(wide))
@@ -449,19 +455,19 @@ impl<'a> PickleMachine<'a> {
 
     /// Reads a UTF-8 text and pushes it onto the stack. The pickle holds the length of the text in bytes first, which
     /// takes `length_bytes` bytes, then the text.
-    fn text(&mut self, length_bytes: usize) -> Result<(), Wrong> {
+    fn text(&mut self, length_bytes: usize) -> Result<(), PickleError> {
         let length = self.length(length_bytes)?;
         let start = self.at;
         self.take_slice(length)?;
         self.allocations.take(ALLOCATION_BYTES + (self.at - start), start)?;
         let text = std::str::from_utf8(&self.bytes[start..self.at]);
-        let text = text.map_err(|_| Wrong::at(start, "a text that is not UTF-8"))?;
+        let text = text.map_err(|_| PickleError::at(start, "a text that is not UTF-8"))?;
         self.push(Node::Text(text.into()), 0)
     }
 
     /// Skips a byte string and pushes [`Node::Opaque`] for it. The pickle holds the length of the byte string first,
     /// which takes `length_bytes` bytes, then the bytes.
-    fn blob(&mut self, length_bytes: usize) -> Result<(), Wrong> {
+    fn blob(&mut self, length_bytes: usize) -> Result<(), PickleError> {
         let length = self.length(length_bytes)?;
         self.take_slice(length)?;
         self.push(Node::Opaque, 0)
@@ -469,12 +475,12 @@ impl<'a> PickleMachine<'a> {
 
     /// Executes the instruction GLOBAL, which began at byte `start`: reads the module and the name of a function or
     /// class as two lines and pushes a node for this function or class.
-    fn global(&mut self, start: usize) -> Result<(), Wrong> {
+    fn global(&mut self, start: usize) -> Result<(), PickleError> {
         let (module, name) = (self.line()?, self.line()?);
         self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
         let text = |line: Range<usize>| {
             std::str::from_utf8(&self.bytes[line.clone()])
-                .map_err(|_| Wrong::at(line.start, "a name that is not UTF-8"))
+                .map_err(|_| PickleError::at(line.start, "a name that is not UTF-8"))
         };
         let global = [text(module)?, ".", text(name)?].concat();
         self.push(Node::Global(global.into()), 0)
@@ -483,10 +489,10 @@ impl<'a> PickleMachine<'a> {
     /// Executes the instruction STACK_GLOBAL, which began at byte `start`: replaces two texts on the stack, a module
     /// and a name, by a node for the function or class with this name. A long text may be used many times, so each copy
     /// of it is counted as memory.
-    fn stack_global(&mut self, start: usize) -> Result<(), Wrong> {
+    fn stack_global(&mut self, start: usize) -> Result<(), PickleError> {
         let (name, module) = (self.pop()?, self.pop()?);
         let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {
-            return Err(Wrong::at(start, "a global without the texts of its module and name"));
+            return Err(PickleError::at(start, "a global without the texts of its module and name"));
         };
         self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
         let global = [module, ".", name].concat();
@@ -494,7 +500,7 @@ impl<'a> PickleMachine<'a> {
     }
 
     /// Reads a line. Returns its byte range without the line end.
-    fn line(&mut self) -> Result<Range<usize>, Wrong> {
+    fn line(&mut self) -> Result<Range<usize>, PickleError> {
         let start = self.at;
         let end = self.bytes[start..].iter().position(|&byte| byte == b'\n');
         self.take_slice(end.map_or(u64::MAX, |end| end as u64 + 1))?;

@@ -66,7 +66,7 @@ fn nesting_is_limited_for_every_instruction() {
     let outside = [b"N".to_vec(), b"Q".repeat(200), b".".to_vec()].concat();
     for bytes in [tuples(deepest + 1), calls, appended, marks, outside] {
         match Pickle::read(&bytes, u64::MAX) {
-            Err(Wrong::TooMuch(_, expected, _)) => assert!(expected.contains("nested"), "{expected}"),
+            Err(PickleError::TooMuch(_, expected, _)) => assert!(expected.contains("nested"), "{expected}"),
             other => panic!("{other:?}"),
         }
     }
@@ -100,16 +100,16 @@ fn memory_is_limited_before_it_is_allocated() {
         let memory = 1 << 20;
         match Pickle::read(&bytes, memory) {
             // The bytes do not end with the instruction STOP.
-            Err(Wrong::Malformed(at, found)) => {
+            Err(PickleError::Malformed(at, found)) => {
                 assert!(at == bytes.len() && found.contains("end"), "{name}: {found}");
             }
-            Err(Wrong::Memory(_, taken)) => assert!(taken > memory, "{name}: {taken}"),
+            Err(PickleError::Memory(_, taken)) => assert!(taken > memory, "{name}: {taken}"),
             other => panic!("{name}: {other:?}"),
         }
     }
     let refused = |name: &str| {
         let bytes = bombs(300_000).into_iter().find(|bomb| bomb.0 == name).unwrap().1;
-        matches!(Pickle::read(&bytes, 1 << 20), Err(Wrong::Memory(..)))
+        matches!(Pickle::read(&bytes, 1 << 20), Err(PickleError::Memory(..)))
     };
     assert!(refused("lists") && refused("long names") && refused("memo") && refused("tuples"));
 }
@@ -118,7 +118,7 @@ fn memory_is_limited_before_it_is_allocated() {
 fn instructions_are_limited() {
     let bytes = [b"(1".repeat(1 << 20), b"N.".to_vec()].concat();
     match Pickle::read(&bytes, u64::MAX) {
-        Err(Wrong::TooMuch(at, expected, _)) => {
+        Err(PickleError::TooMuch(at, expected, _)) => {
             assert!(at == 1 << 21 && expected.contains("2097152 instructions"), "{at}: {expected}");
         }
         other => panic!("{other:?}"),
@@ -135,7 +135,9 @@ fn memo_numbers_and_lengths_may_be_the_largest() {
         b"\x8d\xff\xff\xff\xff\xff\xff\xff\xff",
         b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f",
     ] {
-        assert!(matches!(Pickle::read(start, u64::MAX), Err(Wrong::Malformed(_, found)) if found.contains("end")));
+        assert!(
+            matches!(Pickle::read(start, u64::MAX), Err(PickleError::Malformed(_, found)) if found.contains("end"))
+        );
     }
 }
 
@@ -154,7 +156,7 @@ fn malformed_pickles_are_refused_with_their_position() {
         (b"\x80\x02t.", 3, "never begun"),
     ] {
         match Pickle::read(bytes, u64::MAX) {
-            Err(Wrong::Malformed(place, said)) => {
+            Err(PickleError::Malformed(place, said)) => {
                 assert!(place == at && said.contains(found), "{bytes:?}: {place}, {said}");
             }
             Err(other) => panic!("{bytes:?}: {other:?}"),

@@ -90,9 +90,9 @@ impl RowDefects<'_> {
             if is_replaced && self.ply.has_infinite_logit(start + row) {
                 found.push(("infinite opacity logit", false, INFINITE_LOGIT_REPAIR));
             }
-            self.repaired.add((start + row) as u32, &found);
+            self.repaired.add_row((start + row) as u32, &found);
             let is_finite = |column: Attributes| {
-                let values = block.column(column);
+                let values = block.attribute_values(column);
                 (0..values.width()).all(|c| values.plane(c)[row].is_finite())
             };
             if !Attributes::all().iter().all(is_finite) {

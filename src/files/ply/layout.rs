@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::header::{Element, Property};
 use crate::error::{Error, Result};
-use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
+use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficient_count};
 
 /// Natural logarithm of 1/1000: the thickness that a surfel gets, as a fraction of its smaller axis. (A surfel is a
 /// flat Gaussian of 2DGS. Its file has no `scale_2`.) The thickness is relative, so that results do not depend on the
@@ -60,7 +60,7 @@ impl PlyLayout {
         let rotation = need_all(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
 
         let rest = vertex.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
-        let is_degree = |&degree: &usize| 3 * (sh_coefficients(degree) - 1) == rest;
+        let is_degree = |&degree: &usize| 3 * (sh_coefficient_count(degree) - 1) == rest;
         let Some(stored_degree) = (0..=MAX_STORED_DEGREE).find(is_degree) else {
             let expected = "0, 9, 24, 45 or 72 properties f_rest_* (degree 0 to 4)";
             return Err(Error::input(path, "element vertex", expected, rest.to_string())
@@ -70,7 +70,7 @@ impl PlyLayout {
         // The file stores the SH coefficients of red, then those of green, then those of blue. A plane has the index 3
         // · coefficient + channel.
         let per_channel = rest / 3;
-        for coefficient in 0..sh_coefficients(sh_degree) - 1 {
+        for coefficient in 0..sh_coefficient_count(sh_degree) - 1 {
             for channel in 0..3 {
                 sh.push(need(&format!("f_rest_{}", channel * per_channel + coefficient))?);
             }
@@ -87,8 +87,8 @@ impl PlyLayout {
 
 /// Returns the new name of the property `name` when the SH degree is reduced from `from` to `to`; `None` if the
 /// property is removed.
-pub(crate) fn name_without_bands(name: &str, from: usize, to: usize) -> Option<String> {
-    let [old_count, new_count] = [from, to.min(from)].map(|degree| sh_coefficients(degree) - 1);
+pub(crate) fn name_at_sh_degree(name: &str, from: usize, to: usize) -> Option<String> {
+    let [old_count, new_count] = [from, to.min(from)].map(|degree| sh_coefficient_count(degree) - 1);
     let Some(number) = name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok()) else {
         return Some(name.to_owned());
     };

@@ -26,7 +26,7 @@ use header::Element;
 pub(crate) use header::PlyHeader;
 pub use header::{PlyEncoding, Property, Scalar};
 pub use layout::THIN_LOG_SCALE;
-pub(crate) use layout::{PlaneSource, PlyLayout, name_without_bands};
+pub(crate) use layout::{PlaneSource, PlyLayout, name_at_sh_degree};
 
 use super::map::FileMap;
 use super::open::open_file;
@@ -230,8 +230,8 @@ impl Ply {
         out.resize(ids.len());
         for column in want.iter() {
             let width = self.layout.planes(column).len();
-            if out.column(column).width() != width {
-                *out.column_mut(column) = AttributeValues::zeros(width, ids.len());
+            if out.attribute_values(column).width() != width {
+                *out.attribute_values_mut(column) = AttributeValues::zeros(width, ids.len());
             }
         }
         let rows = &self.body.bytes()[self.rows.clone()];
@@ -247,7 +247,7 @@ impl Ply {
             for column in want.iter() {
                 for (c, plane) in self.layout.planes(column).iter().enumerate() {
                     if let PlaneSource::Property(property) = plane {
-                        let out = &mut out.column_mut(column).plane_mut(c)[first..first + starts.len()];
+                        let out = &mut out.attribute_values_mut(column).plane_mut(c)[first..first + starts.len()];
                         read_plane(rows, &starts, property, big_endian, out);
                     }
                 }

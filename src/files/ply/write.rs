@@ -11,9 +11,9 @@ use std::path::Path;
 use crate::compressed_model::{CompressedModel, ParamDelta};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::{
-    PlaneSource, Ply, PlyEncoding, PlyHeader, PlyLayout, Property, Scalar, name_without_bands, read_plane,
+    PlaneSource, Ply, PlyEncoding, PlyHeader, PlyLayout, Property, Scalar, name_at_sh_degree, read_plane,
 };
-use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
+use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficient_count};
 
 /// Row (Gaussian) to be written to the PLY file of a compressed model, and where its values come from.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,16 +21,17 @@ pub struct OutputRow {
     /// Index of the row of the original file (template) that is copied: the row of the Gaussian itself. For a proxy
     /// (Gaussian that replaces a merged cluster) it is the row of the leader, the most important Gaussian of the
     /// cluster.
-    pub source: u32,
+    pub template_row: u32,
     /// Index of the proxy (Gaussian that replaces a merged cluster) whose attributes replace those of the row; `None`
     /// for a Gaussian that was not merged.
     pub proxy: Option<u32>,
 }
 
-/// Returns the rows to be written to the PLY file of the compressed model `reduction`, in output order.
-pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutputRow> {
-    let mut rows: Vec<OutputRow> = reduction.kept.iter().map(|&source| OutputRow { source, proxy: None }).collect();
-    for (proxy, cluster) in reduction.clusters.iter().enumerate() {
+/// Returns the rows to be written to the PLY file of the compressed model `compressed`, in output order.
+pub fn rows_of_model(compressed: &CompressedModel) -> Vec<OutputRow> {
+    let mut rows: Vec<OutputRow> =
+        compressed.kept.iter().map(|&template_row| OutputRow { template_row, proxy: None }).collect();
+    for (proxy, cluster) in compressed.clusters.iter().enumerate() {
         rows[cluster.output as usize].proxy = Some(proxy as u32);
     }
     rows
@@ -66,9 +67,9 @@ pub fn write_like_template(
     path: &Path,
 ) -> Result<()> {
     check_rows(template, rows, proxies, change)?;
-    let name = |name: &str| name_without_bands(name, template.layout().stored_degree, sh_degree);
+    let name = |name: &str| name_at_sh_degree(name, template.layout().stored_degree, sh_degree);
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
-    let sources: Vec<u32> = rows.iter().map(|row| row.source).collect();
+    let sources: Vec<u32> = rows.iter().map(|row| row.template_row).collect();
     write_rows_like(template, &sources, name, path, |place, bytes| {
         if let Some(proxy) = rows[place].proxy {
             replace_attributes(bytes, template.layout(), big_endian, proxies, proxy as usize);
@@ -141,7 +142,7 @@ pub(crate) fn write_inria_with(
     path: &Path,
 ) -> Result<()> {
     let width = gaussians.sh.width();
-    if !(0..=MAX_SH_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
+    if !(0..=MAX_SH_DEGREE).any(|degree| 3 * sh_coefficient_count(degree) == width) {
         return Err(Error::internal(format!("{width} SH planes belong to no degree from 0 to 3")));
     }
     let rest = width - 3;
@@ -272,7 +273,7 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
 /// degree of `template`, and that `change` has one value per row for each attribute that it changes.
 fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
     for column in change.attributes().iter() {
-        let changes = change.0.column(column).len();
+        let changes = change.0.attribute_values(column).len();
         if changes != rows.len() {
             let message = format!("{}: {changes} changes of {} rows", column.name(), rows.len());
             return Err(Error::internal(message));
@@ -304,7 +305,7 @@ fn replace_attributes(row: &mut [u8], layout: &PlyLayout, big_endian: bool, prox
     for column in Attributes::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {
             if let PlaneSource::Property(property) = plane {
-                put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);
+                put(row, property, big_endian, proxies.attribute_values(column).plane(c)[proxy]);
             }
         }
     }
@@ -315,7 +316,7 @@ fn replace_attributes(row: &mut [u8], layout: &PlyLayout, big_endian: bool, prox
 fn add_delta(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     for column in change.attributes().iter() {
-        let by = change.0.column(column);
+        let by = change.0.attribute_values(column);
         for (c, plane) in template.layout().planes(column).iter().enumerate().take(by.width()) {
             let by = by.plane(c)[place];
             if let (PlaneSource::Property(property), true) = (plane, by != 0.0) {

@@ -10,7 +10,7 @@ fn state(frame: usize, count: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for column in Attributes::all().iter() {
         let fill = |(i, value): (usize, &mut f32)| *value = (1000 * frame + i) as f32;
-        out.column_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
+        out.attribute_values_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
     }
     out
 }

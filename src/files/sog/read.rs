@@ -19,7 +19,7 @@ use crate::files::open::{open_file, read_small};
 use crate::files::webp::RgbaImage;
 use crate::files::zip_directory::declared_directory;
 use crate::limits::ReadLimit;
-use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
+use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficient_count};
 
 /// Maximum length in bytes of `meta.json`; three codebooks take about 20 kB.
 const MAX_META_BYTES: u64 = 1 << 20;
@@ -61,7 +61,7 @@ pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLi
     if meta.count > u64::from(u32::MAX) {
         return Err(Error::input(path, "meta.json, count", "at most 4294967295", meta.count.to_string()));
     }
-    let widest = 4 * 3 * sh_coefficients(MAX_SH_DEGREE) as u64 + 4 * 11;
+    let widest = 4 * 3 * sh_coefficient_count(MAX_SH_DEGREE) as u64 + 4 * 11;
     let per_gaussian = widest + MAX_LARGE_IMAGES * BYTES_PER_PIXEL;
     memory.check(path, "meta.json, count", "the Gaussians of the file", meta.count.saturating_mul(per_gaussian))?;
     let mut of_gaussians = |name: &str| files.image_of_gaussians(path, name, count, memory);
@@ -256,15 +256,15 @@ struct DecodedPalette {
 /// that describes them. Fails if the image does not fit the description. Messages call the archive `path`.
 fn read_palette(entry: &PaletteEntry, image: &RgbaImage, path: &Path) -> Result<DecodedPalette> {
     let name = &entry.files[0];
-    let degree = (1..=MAX_SH_DEGREE).find(|&degree| image.width == 64 * (sh_coefficients(degree) - 1));
+    let degree = (1..=MAX_SH_DEGREE).find(|&degree| image.width == 64 * (sh_coefficient_count(degree) - 1));
     let Some(degree) = degree.filter(|&degree| entry.bands.is_none_or(|bands| bands == degree as u64)) else {
         let expected = match entry.bands {
-            Some(bands @ 1..=3) => format!("a width of {} pixels", 64 * (sh_coefficients(bands as usize) - 1)),
+            Some(bands @ 1..=3) => format!("a width of {} pixels", 64 * (sh_coefficient_count(bands as usize) - 1)),
             _ => "a width of 192, 512 or 960 pixels for 1, 2 or 3 bands".to_owned(),
         };
         return Err(Error::input(path, name, expected, image.width.to_string()));
     };
-    let coefficients = sh_coefficients(degree) - 1;
+    let coefficients = sh_coefficient_count(degree) - 1;
     let there = image.pixels.len() / coefficients;
     let count = entry.count.map_or(there, |count| usize::try_from(count).unwrap_or(usize::MAX));
     if count > there {

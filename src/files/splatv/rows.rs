@@ -73,7 +73,7 @@ pub fn check_rows(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects
     let mut rows: Option<Vec<u32>> = None;
     for row in 0..count as u32 {
         let row_defects = defects(&SplatvGaussian::from_words(&file.words(row as usize)), zero_rotation);
-        found.add(row, &row_defects);
+        found.add_row(row, &row_defects);
         match (row_defects.iter().any(|&(_, dropped, _)| dropped), &mut rows) {
             // This is the first row that is left out: all rows before it are kept.
             (true, None) => rows = Some((0..row).collect()),

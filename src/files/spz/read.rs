@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::files::open::open_file;
 use crate::files::sog::images::decode_opacity;
 use crate::limits::ReadLimit;
-use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
+use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficient_count};
 
 /// First two bytes of a gzip file. `.spz` files of versions 2 and 3 are gzip files.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
@@ -54,7 +54,7 @@ impl Arrays {
     /// Gaussian for a file with the header `header`, and its content.
     fn list(&mut self, header: &Header) -> [(&'static str, usize, &mut Vec<u8>); 6] {
         let rotation = if header.version == 2 { 3 } else { 4 };
-        let harmonics = 3 * (sh_coefficients(header.sh_degree) - 1);
+        let harmonics = 3 * (sh_coefficient_count(header.sh_degree) - 1);
         [
             ("positions", 9, &mut self.positions),
             ("opacities", 1, &mut self.opacities),
@@ -106,8 +106,8 @@ fn parse_header(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<Header> 
     if bits > 24 {
         return Err(Error::input(path, "byte 13, fractional bits", "at most 24", bits.to_string()));
     }
-    let coded = 20 + 3 * (sh_coefficients(usize::from(degree)) as u64 - 1);
-    let decoded = 4 * (11 + 3 * sh_coefficients(MAX_SH_DEGREE) as u64);
+    let coded = 20 + 3 * (sh_coefficient_count(usize::from(degree)) as u64 - 1);
+    let decoded = 4 * (11 + 3 * sh_coefficient_count(MAX_SH_DEGREE) as u64);
     memory.check(path, "byte 8", "the Gaussians of the file", u64::from(count) * (coded + decoded))?;
     Ok(Header { version, count: count as usize, sh_degree: usize::from(degree), bits: i32::from(bits), flags })
 }
@@ -212,7 +212,7 @@ fn decode(header: &Header, arrays: &Arrays) -> Gaussians {
     let degree = header.sh_degree.min(MAX_SH_DEGREE);
     let mut gaussians = Gaussians::zeros(header.count, degree);
     let unit = 0.5f64.powi(header.bits);
-    let stored_coefficients = sh_coefficients(header.sh_degree) - 1;
+    let stored_coefficients = sh_coefficient_count(header.sh_degree) - 1;
     let reversed = [1.0, -1.0, -1.0];
     for i in 0..header.count {
         let position: [f32; 3] = std::array::from_fn(|axis| {
@@ -235,7 +235,7 @@ fn decode(header: &Header, arrays: &Arrays) -> Gaussians {
         }
         let harmonics = &arrays.harmonics[3 * stored_coefficients * i..][..3 * stored_coefficients];
         for (k, (rgb, sign)) in
-            harmonics.as_chunks::<3>().0.iter().zip(AXIS_SIGNS).take(sh_coefficients(degree) - 1).enumerate()
+            harmonics.as_chunks::<3>().0.iter().zip(AXIS_SIGNS).take(sh_coefficient_count(degree) - 1).enumerate()
         {
             for (c, &byte) in rgb.iter().enumerate() {
                 gaussians.sh.plane_mut(3 * (k + 1) + c)[i] = sign * (f32::from(byte) - 128.0) / 128.0;

@@ -33,7 +33,7 @@ pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
     }
 }
 
-/// Checks that an archive restores the compressed model `reduction`, which was made from `model`. The archive has
+/// Checks that an archive restores the compressed model `compressed`, which was made from `model`. The archive has
 /// quantization steps of 2^-16. Returns the kind of output that the archive restores: a model folder, or a file format.
 /// Checks that
 /// - every restored Gaussian of every frame differs by at most `tolerance` from the compressed model (see [`values`]),
@@ -43,11 +43,11 @@ pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
 /// Panics if a check fails.
 pub(in crate::models) fn check_round_trip(
     model: &dyn InputModel,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     options: &OpenOptions,
     tolerance: f64,
 ) -> OutputKind {
-    let content = model.archive_content(reduction).unwrap();
+    let content = model.archive_content(compressed).unwrap();
     let EncodedArchive { bytes, order, .. } = archive::encode(&content, &fine_steps(&content)).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a.gsz");
@@ -64,10 +64,10 @@ pub(in crate::models) fn check_round_trip(
     }
     unpack(&decoded, &file, &restored).unwrap();
     let [restored, opened] = [&restored, &file].map(|path| open(path));
-    assert_eq!(restored.kind(), if kind == model.own_output() { model.kind() } else { restored.kind() });
-    assert_eq!((opened.kind(), opened.own_output()), ("gsz archive", kind));
+    assert_eq!(restored.kind(), if kind == model.default_output_kind() { model.kind() } else { restored.kind() });
+    assert_eq!((opened.kind(), opened.default_output_kind()), ("gsz archive", kind));
 
-    let expected = states(&*model.reduced(reduction).unwrap());
+    let expected = states(&*model.compressed_frames(compressed).unwrap());
     let shown = states(&*model.decode_frames(&decoded).unwrap());
     let found = states(restored.source());
     assert!(found == shown && found == states(opened.source()), "a restored model has other frames than its archive");

@@ -9,7 +9,7 @@ use crate::archive::ArchiveContent;
 use crate::error::{Error, Result};
 use crate::files::names::last_component;
 use crate::files::ply::write::{extra_bytes_per_row, extra_property_bytes, write_rows};
-use crate::files::ply::{Ply, PlyHeader, name_without_bands};
+use crate::files::ply::{Ply, PlyHeader, name_at_sh_degree};
 
 /// Name of the archive part with the header of the PLY file.
 pub(crate) const HEADER: &str = "ply.header";
@@ -42,7 +42,7 @@ pub(crate) fn add_cloud(content: &mut ArchiveContent, template: &Ply, rows: impl
     };
     let lead = around(&|out| template.write_lead(out))?;
     let tail = around(&|out| template.write_tail(out))?;
-    let name = |name: &str| name_without_bands(name, template.layout().stored_degree, content.cloud.sh_degree());
+    let name = |name: &str| name_at_sh_degree(name, template.layout().stored_degree, content.cloud.sh_degree());
     let header = template.header().text_for(content.cloud.len(), name);
     for (name, bytes) in [(HEADER, header), (LEAD, lead), (TAIL, tail)] {
         content.files.insert(name.to_owned(), bytes);

@@ -17,7 +17,7 @@ use zip::ZipArchive;
 
 use crate::archive::ArchiveContent;
 use crate::error::{Error, Result, quoted};
-use crate::model::{Attributes, sh_coefficients};
+use crate::model::{Attributes, sh_coefficient_count};
 
 /// Name of the archive part with the layout.
 pub(super) const LAYOUT: &str = "layout";
@@ -156,7 +156,7 @@ impl Field {
 /// attributes: position, rotation, log scale, opacity and SH coefficients. The planes from this index on hold values
 /// that only the model's format has. `sh_degree` determines the number of SH planes.
 pub(super) fn first_column_plane(sh_degree: usize) -> usize {
-    first_plane(Attributes::SH) + 3 * sh_coefficients(sh_degree)
+    first_plane(Attributes::SH) + 3 * sh_coefficient_count(sh_degree)
 }
 
 /// Returns the index of the first plane (scalar component) of `attribute` in an archive.
@@ -176,7 +176,7 @@ fn values_of(content: &ArchiveContent, plane: usize) -> Option<&[f32]> {
     let cloud = &content.cloud;
     let all = Attributes::all();
     if let Some(attribute) = all.iter().filter(|&attribute| first_plane(attribute) <= plane).last() {
-        let (values, c) = (cloud.column(attribute), plane - first_plane(attribute));
+        let (values, c) = (cloud.attribute_values(attribute), plane - first_plane(attribute));
         if c < values.width() {
             return Some(values.plane(c));
         }
@@ -299,7 +299,7 @@ impl Layout {
     /// `path` is the path of the archive, for messages.
     fn check_size(&self, content: &ArchiveContent, path: &Path) -> Result<()> {
         let count = content.cloud.len() as u64;
-        let values = Attributes::all().iter().map(|attribute| content.cloud.column(attribute).planes().len());
+        let values = Attributes::all().iter().map(|attribute| content.cloud.attribute_values(attribute).planes().len());
         let columns = content.columns.iter().map(|column| column.values.planes().len());
         let tensors = content.tensors.values().map(|tensor| tensor.data.len());
         let values: usize = values.chain(columns).chain(tensors).sum();

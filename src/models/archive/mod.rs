@@ -233,8 +233,8 @@ impl InputModel for OpenArchive {
         self.inner.data_frames()
     }
 
-    fn class(&self, id: u32) -> u8 {
-        self.inner.class(id)
+    fn merge_class(&self, id: u32) -> u8 {
+        self.inner.merge_class(id)
     }
 
     fn data_folder(&self) -> Option<&str> {
@@ -253,43 +253,43 @@ impl InputModel for OpenArchive {
         self.inner.columns()
     }
 
-    fn own_output(&self) -> OutputKind {
-        self.inner.own_output()
+    fn default_output_kind(&self) -> OutputKind {
+        self.inner.default_output_kind()
     }
 
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         self.inner.check_output(kind, path)
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
-        self.inner.solve(clusters, reference, rule)
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        self.inner.compute_proxies(clusters, reference, rule)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        self.inner.reduced(reduction)
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        self.inner.compressed_frames(compressed)
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
-        self.inner.write(reduction, kind, path, limits, events)
+        self.inner.write(compressed, kind, path, limits, events)
     }
 
     fn can_round_field(&self) -> Result<bool> {
         self.inner.can_round_field()
     }
 
-    fn needs_all_bands(&self) -> Option<&'static str> {
-        self.inner.needs_all_bands()
+    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
+        self.inner.reason_to_keep_sh_degree()
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.inner.archive_content(reduction)
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        self.inner.archive_content(compressed)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

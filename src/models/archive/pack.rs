@@ -25,7 +25,7 @@ use crate::files::npz::write::GaussianAxis;
 use crate::files::ply::{Ply, PlyEncoding, Property, Scalar};
 use crate::files::splatv::{ROW_BYTES, Splatv};
 use crate::limits::ReadLimit;
-use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficients};
+use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficient_count};
 use crate::models::four_d_gaussians::cfg_args;
 use crate::models::in_checkpoint::rows::{RowElement, RowTensors};
 
@@ -251,7 +251,7 @@ impl Packer {
             let is_finite = planes.iter().flatten().all(|value: &f32| value.is_finite());
             match target {
                 Target::Attribute(attribute, c) => {
-                    self.content.cloud.column_mut(*attribute).plane_mut(*c).copy_from_slice(&planes[0]);
+                    self.content.cloud.attribute_values_mut(*attribute).plane_mut(*c).copy_from_slice(&planes[0]);
                     coded.push((group[0].to_field)(first_plane(*attribute) + c));
                 }
                 Target::Column(name) if is_finite => {
@@ -299,7 +299,7 @@ impl Packer {
         let at = ply.header().text.len() + ply.bytes_around()[0];
         let degree = self.content.cloud.sh_degree();
         let rest = ply.properties().iter().filter(|property| property.name.starts_with("f_rest_")).count();
-        let has_all_degrees = rest == 3 * (sh_coefficients(degree) - 1);
+        let has_all_degrees = rest == 3 * (sh_coefficient_count(degree) - 1);
         let field = |property: &Property| match property.scalar {
             Scalar::F32 => RowField::f32(ply_target(&property.name, degree, has_all_degrees)),
             other => RowField::exact(other.bytes()),
@@ -395,7 +395,7 @@ impl Packer {
                 RowElement::Unread => Target::Zeros,
                 _ if tensor.kind != ValueType::F32 => Target::Bytes,
                 RowElement::Attribute(attribute, c) => Target::Attribute(*attribute, *c),
-                RowElement::Own(_) => Target::Column(name.to_owned()),
+                RowElement::FormatSpecific(_) => Target::Column(name.to_owned()),
             };
             let field = |element: &RowElement| RowField { bytes: bytes_per_value, ..RowField::f32(target(element)) };
             let fields: Vec<RowField> = stored.iter().map(field).collect();
@@ -467,7 +467,7 @@ impl Packer {
                     None => Field::F32(first + c * (frames - start) + frame - start),
                 };
                 if let Some(attribute) = attribute.filter(|_| frame == 0) {
-                    let to = self.content.cloud.column_mut(attribute);
+                    let to = self.content.cloud.attribute_values_mut(attribute);
                     (0..width).for_each(|c| to.plane_mut(c).copy_from_slice(&plane(0, c)));
                 }
                 let at = (at + frame * frame_bytes) as u64;
@@ -484,7 +484,7 @@ impl Packer {
 fn ply_target(name: &str, degree: usize, has_all_degrees: bool) -> Target {
     let stem = name.trim_end_matches(|c: char| c.is_ascii_digit());
     let number: Option<usize> = name[stem.len()..].parse().ok();
-    let rest = sh_coefficients(degree) - 1;
+    let rest = sh_coefficient_count(degree) - 1;
     match (stem, number) {
         ("x", None) => Target::Attribute(Attributes::POSITION, 0),
         ("y", None) => Target::Attribute(Attributes::POSITION, 1),

@@ -14,7 +14,7 @@ use crate::model::SequenceInfo;
 use crate::models::input_model::{InputModel, OpenOptions};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
-use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
+use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadCounts, ReadPlan};
 
 /// Function and options with which an input model was opened. They serve to open it again after it has been stored in
 /// an archive (`.gsz`).
@@ -35,7 +35,7 @@ impl Reopener {
         Reopener { open, options }
     }
 
-    /// Returns the content of an archive of `reduction`, the compressed form of `model`. First writes the compressed
+    /// Returns the content of an archive of `compressed`, the compressed form of `model`. First writes the compressed
     /// model to a temporary folder, as the kind of output `kind`, to a file or folder called `name`. `holds` returns
     /// the kind of content of a written file, given the path of the file relative to the model folder.
     ///
@@ -44,7 +44,7 @@ impl Reopener {
     pub(in crate::models) fn content<'a>(
         &self,
         model: &dyn InputModel,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         (kind, name): (OutputKind, &str),
         holds: impl Fn(&str) -> FileContent<'a>,
     ) -> Result<ArchiveContent> {
@@ -53,9 +53,9 @@ impl Reopener {
         if kind == OutputKind::Model {
             std::fs::create_dir(&path).map_err(Error::io("create", &path))?;
         }
-        model.write(reduction, kind, &path, &Limits::NONE, &Events::default())?;
-        let degree = model.source().info().sh_degree.min(reduction.sh_degree);
-        Packer::new(reduction.len(), degree, self.options.memory).pack(&path, holds)
+        model.write(compressed, kind, &path, &Limits::NONE, &Events::default())?;
+        let degree = model.source().info().sh_degree.min(compressed.sh_degree);
+        Packer::new(compressed.len(), degree, self.options.memory).pack(&path, holds)
     }
 
     /// Opens the model whose archive has the content `content`, and returns its frames at `times`.
@@ -100,11 +100,11 @@ impl FrameSource for RestoredFrames {
         self.model.source().decoder()
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.model.source().reads()
     }
 
-    fn ahead(&self) -> Option<&dyn Prefetch> {
-        self.model.source().ahead()
+    fn prefetcher(&self) -> Option<&dyn Prefetch> {
+        self.model.source().prefetcher()
     }
 }

@@ -133,27 +133,27 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
     }
 
     /// Writes the compressed model as a model folder at `path`.
-    fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
+    fn write_folder(&self, compressed: &CompressedModel, path: &Path) -> Result<()> {
         let to = Paths::new(path, self.paths.iteration);
         for file in [&to.point_cloud, &to.network] {
             let folder = file.parent().unwrap_or(path);
             fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
         }
-        fs::write(&to.cfg_args, self.cfg_args(reduction.sh_degree)?).map_err(Error::io("write", &to.cfg_args))?;
+        fs::write(&to.cfg_args, self.cfg_args(compressed.sh_degree)?).map_err(Error::io("write", &to.cfg_args))?;
         copy(&self.paths.network, &to.network)?;
         let cameras = self.paths.root.join("cameras.json");
         if cameras.is_file() {
             copy(&cameras, &path.join("cameras.json"))?;
         }
         let none = Gaussians::zeros(0, self.model.info().sh_degree);
-        let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
-        let mut rows = rows_of_model(reduction);
-        for cluster in &reduction.clusters {
+        let proxies = compressed.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
+        let mut rows = rows_of_model(compressed);
+        for cluster in &compressed.clusters {
             // A proxy gets the features of its member (merged Gaussian) with the largest weight.
-            rows[cluster.output as usize].source = heaviest(cluster);
+            rows[cluster.output as usize].template_row = heaviest(cluster);
         }
         let template = Ply::open(&self.paths.point_cloud)?;
-        write_like_template(&template, &rows, proxies, &reduction.delta, reduction.sh_degree, &to.point_cloud)
+        write_like_template(&template, &rows, proxies, &compressed.delta, compressed.sh_degree, &to.point_cloud)
     }
 }
 
@@ -242,7 +242,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
             // A copy of the stored parameters, the values prepared from them, and the network's outputs for a block of
             // Gaussians.
             reader: 2 * whole + motion_model.bytes_per_gaussian() as u64 + 128,
-            reduced: 2 * whole,
+            compressed: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
             prepared: 0,
             file: whole + 24,
@@ -286,7 +286,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         Some(&self.model.raw().gaussians)
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         OutputKind::Model
     }
 
@@ -297,38 +297,38 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule)
         })
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, reduction, (self.own_output(), "model"), FileContent::from_name)
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener.content(self, compressed, (self.default_output_kind(), "model"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.reopener.frames(content, &self.model.info().times)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.compressed_frames(reduction)))
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.compressed_frames(compressed)))
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
         let mut notes = match kind {
-            OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events)?,
+            OutputKind::Model => self.write_folder(compressed, path).map(|()| Vec::new())?,
+            _ => write_sequence(&*self.compressed_frames(compressed)?, kind, path, limits.max_kept_frames, events)?,
         };
         let left = Attributes::all().difference(self.model.motion_model().movable());
-        if !reduction.delta.is_empty() && !left.is_empty() {
+        if !compressed.delta.is_empty() && !left.is_empty() {
             notes.push(
                 "scales and rotations were not refined: the covariances of this model do not follow from its \
                  quaternions alone"

@@ -144,7 +144,7 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     for (&frame, wanted) in frames.iter().zip(wanted) {
         gaussians.state(frame, Attributes::POSITION, &mut state)?;
         let slopes = gaussians.jacobian(frame, Attributes::POSITION)?;
-        let slopes = slopes.column(Attributes::POSITION);
+        let slopes = slopes.derivative(Attributes::POSITION);
         for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
             // Plane 3·i + j holds the derivative of component i by component j, so reading columns gives the transpose.
             let transposed = DMat3::from_cols_array(&slopes.row::<9>(row).map(f64::from));

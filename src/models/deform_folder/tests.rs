@@ -321,18 +321,19 @@ fn jacobian_agrees_with_finite_differences() {
             for j in 0..column.width(1) {
                 let by = |by: f32| {
                     let mut raw = stored.clone();
-                    raw.gaussians.column_mut(column).plane_mut(j).iter_mut().for_each(|x| *x += by);
+                    raw.gaussians.attribute_values_mut(column).plane_mut(j).iter_mut().for_each(|x| *x += by);
                     state(&raw)
                 };
                 let (above, below) = (by(step), by(-step));
                 let mut change = Gaussians::default();
-                *change.column_mut(column) = AttributeValues::zeros(column.width(1), COUNT);
-                change.column_mut(column).plane_mut(j).fill(1.0);
+                *change.attribute_values_mut(column) = AttributeValues::zeros(column.width(1), COUNT);
+                change.attribute_values_mut(column).plane_mut(j).fill(1.0);
                 let mut found = Gaussians::zeros(COUNT, 1);
                 jacobian.add_to(&change, &mut found);
                 for i in 0..column.width(1) {
-                    let planes = above.column(column).plane(i).iter().zip(below.column(column).plane(i));
-                    for ((a, b), found) in planes.zip(found.column(column).plane(i)) {
+                    let planes =
+                        above.attribute_values(column).plane(i).iter().zip(below.attribute_values(column).plane(i));
+                    for ((a, b), found) in planes.zip(found.attribute_values(column).plane(i)) {
                         let expected = (a - b) / (2.0 * step);
                         all += 1;
                         wrong += usize::from((found - expected).abs() > 0.03 * (1.0 + expected.abs()));
@@ -348,23 +349,23 @@ fn jacobian_agrees_with_finite_differences() {
 }
 
 /// Returns a compressed model with two proxies (Gaussians that replace merged ones) and parameter deltas.
-fn reduction(model: &dyn InputModel) -> CompressedModel {
+fn compressed(model: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
-    let mut reduction = CompressedModel::pruned(vec![1, 4, 9, 12, 30], &rule);
-    reduction.clusters = vec![
+    let mut compressed = CompressedModel::pruned(vec![1, 4, 9, 12, 30], &rule);
+    compressed.clusters = vec![
         Cluster { output: 1, leader: 4, members: vec![(3, 0.6), (4, 0.4)] },
         Cluster { output: 3, leader: 12, members: vec![(12, 0.5), (17, 0.25), (39, 0.25)] },
     ];
     // Random motion exceeds any drift limit, so the limit is lifted to test how proposed proxies are written.
     let rule = crate::recipe::MergeParams { max_drift: f64::INFINITY, ..rule };
     let reference = ReferenceFrame { frame: 0, extent: 1.0 };
-    reduction.proxies = model.solve(&reduction.clusters, reference, &rule).unwrap();
+    compressed.proxies = model.compute_proxies(&compressed.clusters, reference, &rule).unwrap();
     let mut by = Gaussians::zeros(5, 0);
     by.rotation = AttributeValues::default();
     by.position.set_row(2, [0.5, 0.0, -0.25]);
     by.sh.set_row(0, [0.1, 0.0, 0.2]);
-    reduction.delta = ParamDelta(by);
-    reduction
+    compressed.delta = ParamDelta(by);
+    compressed
 }
 
 #[test]
@@ -411,14 +412,19 @@ fn written_proxies_and_deltas_read_back() {
         TestModel::sc_gs(ALL_VARIANTS[2]),
     ] {
         let model = made.open();
-        let mut reduction = reduction(&*model);
+        let mut compressed = compressed(&*model);
         for sh_degree in [1, 0] {
-            reduction.sh_degree = sh_degree;
+            compressed.sh_degree = sh_degree;
             let path = made.folder.path().join(format!("result_{sh_degree}"));
             fs::create_dir(&path).unwrap();
-            model.write(&reduction, OutputKind::Model, &path, &Limits::NONE, &Events::IGNORED).unwrap();
+            model.write(&compressed, OutputKind::Model, &path, &Limits::NONE, &Events::IGNORED).unwrap();
             let again = open(&path).unwrap();
-            assert_eq!(states(again.source()), states(&*model.reduced(&reduction).unwrap()), "{}", model.kind());
+            assert_eq!(
+                states(again.source()),
+                states(&*model.compressed_frames(&compressed).unwrap()),
+                "{}",
+                model.kind()
+            );
             let text = fs::read_to_string(path.join("cfg_args")).unwrap();
             assert!(text.contains(&format!("sh_degree={sh_degree}")), "{text}");
         }
@@ -437,11 +443,11 @@ fn proxy_of_equal_members_equals_them() {
         let model = made.open();
         let rule = Recipe::preset("default").unwrap().merge;
         let clusters = [Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] }];
-        let proxies = model.solve(&clusters, ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
-        let mut reduction = CompressedModel::pruned(vec![0], &rule);
-        (reduction.clusters, reduction.proxies) = (clusters.to_vec(), proxies);
-        assert!(reduction.proxies.deviation.unwrap() < 1e-6, "{:?}", reduction.proxies);
-        let (shown, all) = (model.reduced(&reduction).unwrap(), states(model.source()));
+        let proxies = model.compute_proxies(&clusters, ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
+        let mut compressed = CompressedModel::pruned(vec![0], &rule);
+        (compressed.clusters, compressed.proxies) = (clusters.to_vec(), proxies);
+        assert!(compressed.proxies.deviation.unwrap() < 1e-6, "{:?}", compressed.proxies);
+        let (shown, all) = (model.compressed_frames(&compressed).unwrap(), states(model.source()));
         for (frame, state) in states(&*shown).iter().enumerate() {
             assert!((0..3).all(|c| (state.position.plane(c)[0] - all[frame].position.plane(c)[0]).abs() < 1e-6));
             // Scales and rotations of proxies are right on average only; random quaternions have any length.

@@ -170,7 +170,7 @@ impl MotionModel for DeformableMotion {
                     (0..3).for_each(|i| out.plane_mut(3 * i + axis)[row] = change[i] as f32);
                 }
             }
-            *found.column_mut(Attributes::POSITION) = out;
+            *found.derivative_mut(Attributes::POSITION) = out;
         }
         Ok(found)
     }

@@ -71,7 +71,7 @@ impl InputModel for Params {
             opening: 0,
             reader: 8,
             // Scales and opacities of proxies (Gaussians that replace merged ones), and their indices.
-            reduced: state_bytes(0, Attributes::all()) + 16,
+            compressed: state_bytes(0, Attributes::all()) + 16,
             jacobian: 0,
             prepared: 0,
             file: 0,
@@ -97,11 +97,11 @@ impl InputModel for Params {
         Some([0.0; 3])
     }
 
-    fn class(&self, id: u32) -> u8 {
+    fn merge_class(&self, id: u32) -> u8 {
         u8::from(self.is_foreground(id as usize).unwrap_or(false))
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         OutputKind::Model
     }
 
@@ -112,47 +112,48 @@ impl InputModel for Params {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], _: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
-        proxies::solve(self, clusters, rule)
+    fn compute_proxies(&self, clusters: &[Cluster], _: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        proxies::compute_proxies(self, clusters, rule)
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener().content(self, reduction, (self.own_output(), "model"), |_| FileContent::Npz(Params::archived))
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener()
+            .content(self, compressed, (self.default_output_kind(), "model"), |_| FileContent::Npz(Params::archived))
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.reopener().frames(content, &self.info().times)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(proxies::reduced(self, reduction))
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(proxies::compressed_frames(self, compressed))
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
-            OutputKind::Model => self.write_params(reduction, path.join(FILE)).map(|()| Vec::new()),
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events),
+            OutputKind::Model => self.write_params(compressed, path.join(FILE)).map(|()| Vec::new()),
+            _ => write_sequence(&*self.compressed_frames(compressed)?, kind, path, limits.max_kept_frames, events),
         }
     }
 }
 
 impl Params {
     /// Writes the compressed model as a `params.npz` file to `path`.
-    fn write_params(&self, reduction: &CompressedModel, path: PathBuf) -> Result<()> {
-        let merged = MergedSource::new(self, reduction);
-        let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
+    fn write_params(&self, compressed: &CompressedModel, path: PathBuf) -> Result<()> {
+        let merged = MergedSource::new(self, compressed);
+        let places: Vec<u32> = compressed.clusters.iter().map(|cluster| cluster.output).collect();
         let (mut proxies, mut state) = (merged.open(Ids::List(&places))?, Gaussians::zeros(0, 0));
-        let by = &reduction.delta.0;
+        let by = &compressed.delta.0;
         write_like(
             self.npz(),
-            &reduction.kept,
+            &compressed.kept,
             Params::axis,
             |name, frame, values| {
                 let column = match name {
@@ -171,11 +172,11 @@ impl Params {
                 let mut changed = places.clone();
                 for (proxy, &place) in places.iter().enumerate() {
                     for c in 0..width {
-                        let value = state.column(column).plane(c)[proxy];
+                        let value = state.attribute_values(column).plane(c)[proxy];
                         values[place as usize * width + c] = if is_color { color_from_sh(value) as f32 } else { value };
                     }
                 }
-                let by = by.column(column);
+                let by = by.attribute_values(column);
                 for row in 0..by.len() {
                     let mut differs = false;
                     for c in 0..width.min(by.width()) {

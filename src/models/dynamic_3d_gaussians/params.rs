@@ -13,7 +13,7 @@ use crate::files::npz::write::GaussianAxis;
 use crate::files::npz::{Floats, Npz, NpzArray};
 use crate::model::{Attributes, Gaussians, SequenceInfo, finite_logit, sh_from_color};
 use crate::models::archive::reopen::Reopener;
-use crate::source::{BlockReader, FrameSource, Ids, Reads, SharedCounter};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, SharedCounter};
 
 /// Name of the array of positions.
 pub(super) const MEANS: &str = "means3D";
@@ -175,9 +175,9 @@ impl FrameSource for Params {
         Ok(Box::new(TrajectoryBlock { params: self, ids: ids.iter().collect() }))
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         let states = self.states.get();
-        Reads { states, ..Reads::default() }
+        ReadCounts { states, ..ReadCounts::default() }
     }
 }
 
@@ -195,7 +195,7 @@ impl BlockReader for TrajectoryBlock<'_> {
         }
         means.check()?;
         states.add(self.ids.len() as u64);
-        out.columns_mut(want).for_each(|column| column.resize(self.ids.len()));
+        out.selected_attribute_values_mut(want).for_each(|column| column.resize(self.ids.len()));
         for (row, &id) in self.ids.iter().enumerate() {
             let at = frame * info.count + id;
             for column in want.iter() {

@@ -13,7 +13,7 @@ use crate::model::{Attributes, Gaussians, SequenceInfo, logit, opacity};
 use crate::models::trajectories::merged;
 use crate::passes::{SourceWithDeltas, gather_all};
 use crate::recipe::MergeParams;
-use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 
 /// Maximum number of frames over which scale and opacity of a proxy (Gaussian that replaces merged ones) are averaged.
 const SAMPLED_FRAMES: usize = 16;
@@ -26,7 +26,7 @@ const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 ///
 /// # Errors
 /// Fails if frames cannot be read.
-pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) -> Result<Proxies> {
+pub(super) fn compute_proxies(params: &Params, clusters: &[Cluster], merge: &MergeParams) -> Result<Proxies> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
     let proxies = MergedSequence::new(params, &leaders, members, merge);
@@ -50,35 +50,35 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) 
     Ok(Proxies { raw: Some(raw.into()), ..Proxies::default() })
 }
 
-/// Returns the frames of the compressed model that `reduction` describes.
-pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
+/// Returns the frames of the compressed model that `compressed` describes.
+pub(super) fn compressed_frames<'a>(params: &'a Params, compressed: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
     Box::new(SourceWithDeltas::new(
-        Box::new(MergedSource::new(params, reduction)),
-        &reduction.delta,
-        &reduction.trajectory_delta,
-        reduction.sh_degree,
+        Box::new(MergedSource::new(params, compressed)),
+        &compressed.delta,
+        &compressed.trajectory_delta,
+        compressed.sh_degree,
     ))
 }
 
 /// Frames of a compressed model. Its proxies (Gaussians that replace merged ones) have the constant scales and
-/// opacities that [`solve`] computes.
+/// opacities that [`compute_proxies`] computes.
 pub(super) struct MergedSource<'a> {
     merged: MergedSequence<'a>,
-    reduction: &'a CompressedModel,
+    compressed: &'a CompressedModel,
     info: SequenceInfo,
 }
 
 impl<'a> MergedSource<'a> {
-    /// Creates the frames of the compressed model `reduction`, which is made from the Gaussians in `params`.
-    pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> MergedSource<'a> {
-        let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
-        MergedSource { merged: merged(params, reduction), reduction, info }
+    /// Creates the frames of the compressed model `compressed`, which is made from the Gaussians in `params`.
+    pub(super) fn new(params: &'a Params, compressed: &'a CompressedModel) -> MergedSource<'a> {
+        let info = SequenceInfo { count: compressed.len(), ..params.info().clone() };
+        MergedSource { merged: merged(params, compressed), compressed, info }
     }
 
     /// Finds the proxies (Gaussians that replace merged ones) among the output Gaussians with the indices `places`.
     /// Returns a pair for each proxy: its position in `places`, and the index of its cluster (merged Gaussians).
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
-        let clusters = &self.reduction.clusters;
+        let clusters = &self.compressed.clusters;
         let mut by_output: Vec<(u32, usize)> =
             clusters.iter().enumerate().map(|(proxy, cluster)| (cluster.output, proxy)).collect();
         by_output.sort_unstable();
@@ -89,7 +89,7 @@ impl<'a> MergedSource<'a> {
     /// Returns a reader of the output Gaussians `ids`. It reads them with `reader`, then replaces the scales and
     /// opacities of proxies (Gaussians that replace merged ones) by their constant values.
     fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
-        let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
+        let raw = self.compressed.proxies.raw.as_ref().map(|raw| &raw.gaussians);
         Box::new(MergedReader { reader, proxies: self.proxies(ids.iter()), raw })
     }
 }
@@ -108,7 +108,7 @@ impl FrameSource for MergedSource<'_> {
         Some(opened.map(|reader| self.reader(reader, Ids::Range(0..self.info.count))))
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.merged.reads()
     }
 }

@@ -81,7 +81,7 @@ fn states_are_the_array_values_compressed_or_not() {
         }
     }
     assert_eq!(states(&*open(&small).unwrap()), found);
-    assert_eq!((0..5).map(|id| model.class(id)).collect::<Vec<_>>(), [0, 0, 0, 1, 1]);
+    assert_eq!((0..5).map(|id| model.merge_class(id)).collect::<Vec<_>>(), [0, 0, 0, 1, 1]);
 }
 
 /// Writes the test model to the `.npz` file `path`, with the array `log_scales` as f64. `kind` is the NumPy type of
@@ -139,10 +139,10 @@ fn kept_rows_keep_their_bytes() {
         let rule = Recipe::preset("default").unwrap().merge;
         let result = folder.path().join("result");
         let limits = Limits::NONE;
-        let written = |reduction: &CompressedModel| {
+        let written = |compressed: &CompressedModel| {
             _ = fs::remove_dir_all(&result);
             fs::create_dir(&result).unwrap();
-            model.write(reduction, OutputKind::Model, &result, &limits, &Events::IGNORED).unwrap();
+            model.write(compressed, OutputKind::Model, &result, &limits, &Events::IGNORED).unwrap();
             fs::read(result.join(FILE)).unwrap()
         };
         let read_array = |name: &str| {
@@ -181,21 +181,21 @@ fn written_proxies_and_deltas_read_back() {
     let model = open(&path).unwrap();
     let rule = Recipe::preset("default").unwrap().merge;
     let cluster = Cluster { output: 1, leader: 3, members: vec![(3, 0.75), (4, 0.25)] };
-    let proxies = model.solve(std::slice::from_ref(&cluster), ReferenceFrame::default(), &rule).unwrap();
+    let proxies = model.compute_proxies(std::slice::from_ref(&cluster), ReferenceFrame::default(), &rule).unwrap();
     let mut by = Gaussians::zeros(3, 0);
     by.position.set_row(0, [0.5, 0.0, -0.25]);
     by.sh.set_row(2, [0.1, 0.2, 0.0]);
     let pruned = CompressedModel::pruned(vec![0, 3, 4], &rule);
-    let reduction = CompressedModel { clusters: vec![cluster], proxies, delta: ParamDelta(by), ..pruned };
-    let shown = model.reduced(&reduction).unwrap();
+    let compressed = CompressedModel { clusters: vec![cluster], proxies, delta: ParamDelta(by), ..pruned };
+    let shown = model.compressed_frames(&compressed).unwrap();
     let result = folder.path().join("result");
     fs::create_dir(&result).unwrap();
-    model.write(&reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
+    model.write(&compressed, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
     let read = open(&result).unwrap();
     for (frame, state) in states(&*read).iter().enumerate() {
         let expected = gather_all(&*shown, frame, Attributes::all()).unwrap();
         for column in Attributes::all().iter() {
-            let pairs = state.column(column).planes().iter().zip(expected.column(column).planes());
+            let pairs = state.attribute_values(column).planes().iter().zip(expected.attribute_values(column).planes());
             pairs.for_each(|(a, b)| assert!((a - b).abs() < 1e-6, "{} {a} {b}", column.name()));
         }
         // A proxy is at the weighted mean of its members.

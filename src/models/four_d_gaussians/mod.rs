@@ -86,7 +86,7 @@ impl InputModel for ModelFolder {
             // A copy of the canonical values, the values prepared from them, and the field's deltas.
             reader: 2 * whole + self.field().bytes_per_gaussian() as u64 + 128,
             // The canonical values of the compressed model, and a copy while they are computed.
-            reduced: 2 * whole,
+            compressed: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             prepared: self.field().bytes_per_gaussian_with_slopes() as u64,
             file: whole + 24,
@@ -125,7 +125,7 @@ impl InputModel for ModelFolder {
         Some(ModelFolder::canonical(self))
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         OutputKind::Model
     }
 
@@ -133,11 +133,11 @@ impl InputModel for ModelFolder {
         Ok(())
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
-        proxies::solve(self, clusters, reference, rule)
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        proxies::compute_proxies(self, clusters, reference, rule)
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
         let paths = self.paths();
         if !self.can_round_field()? {
             return Err(Error::usage(format!(
@@ -159,7 +159,7 @@ impl InputModel for ModelFolder {
         };
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
-        let cloud = compressed_raw(self.stored(), reduction).gaussians;
+        let cloud = compressed_raw(self.stored(), compressed).gaussians;
         let cfg_args = self.cfg_args(cloud.sh_degree())?;
         let cfg_args = cfg_args::with_file_names_only(&cfg_args, &paths.cfg_args)?.into_bytes();
         let mut content = ArchiveContent {
@@ -169,7 +169,7 @@ impl InputModel for ModelFolder {
             times: [first as f32, last as f32],
             ..ArchiveContent::default()
         };
-        add_cloud(&mut content, &Ply::open(&paths.point_cloud)?, reduction.kept.iter().copied())?;
+        add_cloud(&mut content, &Ply::open(&paths.point_cloud)?, compressed.kept.iter().copied())?;
         content.files.insert(CFG_ARGS.to_owned(), cfg_args);
         content.files.insert(ITERATION.to_owned(), paths.iteration.to_string().into_bytes());
         Ok(content)
@@ -181,9 +181,9 @@ impl InputModel for ModelFolder {
         Ok(Box::new(self.with_canonical(content.cloud.clone()).with_field(field)))
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        let model = self.with_canonical(compressed_raw(self.stored(), reduction).gaussians);
-        Ok(Box::new(match reduction.field {
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        let model = self.with_canonical(compressed_raw(self.stored(), compressed).gaussians);
+        Ok(Box::new(match compressed.field {
             FieldPrecision::Exact => model,
             FieldPrecision::Half => model.rounded()?,
         }))
@@ -193,7 +193,7 @@ impl InputModel for ModelFolder {
         is_floating(&self.paths().deformation, self.memory())
     }
 
-    fn needs_all_bands(&self) -> Option<&'static str> {
+    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
         self.field().deformed_attributes().contains(Attributes::SH).then_some(
             "the SH head of the deformation field adds to \
                                                                coefficients of every degree",
@@ -202,7 +202,7 @@ impl InputModel for ModelFolder {
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
@@ -215,9 +215,9 @@ impl InputModel for ModelFolder {
                 let folder = iteration_folder(path, paths.iteration);
                 fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
                 let config = path.join("cfg_args");
-                fs::write(&config, self.cfg_args(reduction.sh_degree)?).map_err(Error::io("write", &config))?;
-                self.write_field(reduction.field, &folder.join("deformation.pth"))?;
-                self.write_cloud(reduction, &folder.join("point_cloud.ply"))?;
+                fs::write(&config, self.cfg_args(compressed.sh_degree)?).map_err(Error::io("write", &config))?;
+                self.write_field(compressed.field, &folder.join("deformation.pth"))?;
+                self.write_cloud(compressed, &folder.join("point_cloud.ply"))?;
                 let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
                 let bytes = bytes_read_for(training.map(PathBuf::as_path))?;
                 if bytes > 0 {
@@ -227,14 +227,20 @@ impl InputModel for ModelFolder {
                     ));
                 }
             }
-            OutputKind::Ply => self.write_cloud(reduction, path)?,
+            OutputKind::Ply => self.write_cloud(compressed, path)?,
             OutputKind::Archive => {
                 return Err(Error::internal(
                     "an archive is written from its content, not by the \
                                                                model",
                 ));
             }
-            _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events)?),
+            _ => notes.extend(write_sequence(
+                &*self.compressed_frames(compressed)?,
+                kind,
+                path,
+                limits.max_kept_frames,
+                events,
+            )?),
         }
         Ok(notes)
     }
@@ -261,11 +267,18 @@ impl ModelFolder {
 
     /// Writes the Gaussians of the compressed model to the PLY file `path`, with the properties and comments of the
     /// input's point cloud file.
-    fn write_cloud(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
+    fn write_cloud(&self, compressed: &CompressedModel, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);
-        let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
+        let proxies = compressed.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let template = Ply::open(&self.paths().point_cloud)?;
-        write_like_template(&template, &rows_of_model(reduction), proxies, &reduction.delta, reduction.sh_degree, path)
+        write_like_template(
+            &template,
+            &rows_of_model(compressed),
+            proxies,
+            &compressed.delta,
+            compressed.sh_degree,
+            path,
+        )
     }
 }
 

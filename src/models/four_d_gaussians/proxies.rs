@@ -6,7 +6,7 @@ use super::ModelFolder;
 use crate::compressed_model::{Cluster, Proxies, ReferenceFrame};
 use crate::deform::Deltas;
 use crate::error::Result;
-use crate::merging::proxy::merge_state;
+use crate::merging::proxy::merge_member_states;
 use crate::model::{Attributes, Gaussians};
 use crate::passes::{GAUSSIANS_PER_BLOCK, gather};
 use crate::recipe::{MergeParams, ProxyPosition};
@@ -28,7 +28,7 @@ const SAMPLED_FRAMES: usize = 16;
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
-pub(super) fn solve(
+pub(super) fn compute_proxies(
     model: &ModelFolder,
     all: &[Cluster],
     reference: ReferenceFrame,
@@ -96,7 +96,7 @@ fn merged_states(
         let members: Vec<(u32, f64)> =
             cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
         let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
-        merge_state(&members, &of_members, members[leader].0, merge, Attributes::all()).write(
+        merge_member_states(&members, &of_members, members[leader].0, merge, Attributes::all()).write(
             Attributes::all(),
             proxy,
             &mut states,
@@ -131,7 +131,7 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
         columns
             .iter()
             .flat_map(|&column| {
-                let column = state.column(column);
+                let column = state.attribute_values(column);
                 (0..column.width()).map(|c| column.plane(c)[row]).collect::<Vec<f32>>()
             })
             .collect()
@@ -139,8 +139,8 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     let unsolved: Vec<usize> = (0..raw.len()).filter(|&row| planes(raw, row).iter().any(|x| !x.is_finite())).collect();
     for &row in &unsolved {
         for &column in &columns {
-            for c in 0..leaders.column(column).width() {
-                raw.column_mut(column).plane_mut(c)[row] = leaders.column(column).plane(c)[row];
+            for c in 0..leaders.attribute_values(column).width() {
+                raw.attribute_values_mut(column).plane_mut(c)[row] = leaders.attribute_values(column).plane(c)[row];
             }
         }
     }

@@ -141,7 +141,7 @@ impl MotionModel for FreeTime {
                     slope(inverse_odds, exponent) as f32
                 }
             });
-            *jacobian.column_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes.collect());
+            *jacobian.derivative_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes.collect());
         }
         Ok(jacobian)
     }

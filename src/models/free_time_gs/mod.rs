@@ -20,7 +20,7 @@ use crate::files::checkpoint::{Checkpoint, NodeId, Pickle};
 use crate::files::ftgs::{LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY};
 use crate::files::state_dict::wrapper_note;
 use crate::limits::ReadLimit;
-use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
+use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficient_count};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
 use frame_state::FreeTime;
 
@@ -142,14 +142,14 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     let count = row_count(&checkpoint, nodes[0], &place("means"))?;
     let rest = checkpoint.float_tensor(nodes[5], &place("shN"))?;
     let bands = rest.shape.get(1).map(|bands| bands + 1);
-    let Some(degree) = (0..=MAX_SH_DEGREE).find(|&degree| bands == Some(sh_coefficients(degree))) else {
+    let Some(degree) = (0..=MAX_SH_DEGREE).find(|&degree| bands == Some(sh_coefficient_count(degree))) else {
         return Err(checkpoint.wrong(
             &place("shN"),
             "shape [N, 0, 3], [N, 3, 3], [N, 8, 3] or [N, 15, 3]",
             rest.describe(),
         ));
     };
-    let bands = sh_coefficients(degree);
+    let bands = sh_coefficient_count(degree);
     let mut reader =
         CheckpointReader::new(checkpoint, count, degree, if has_motion { PARAMS_PER_GAUSSIAN } else { 0 })?;
     let planes = [
@@ -169,7 +169,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         ("velocities", &[3], VELOCITY, 3),
     ];
     for (id, (name, row, first, width)) in motion_nodes.into_iter().zip(motion_tensors) {
-        reader.read(id, &place(name), row, RowElement::own(first, width))?;
+        reader.read(id, &place(name), row, RowElement::format_specific(first, width))?;
     }
     training_nodes.into_iter().for_each(|id| reader.add_training_tensor(id));
     Ok(match has_motion {

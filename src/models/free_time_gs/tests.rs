@@ -84,10 +84,10 @@ impl ResultFolder {
         self.0.path().join(name)
     }
 
-    fn written(&self, model: &dyn InputModel, reduction: &CompressedModel) -> PathBuf {
+    fn written(&self, model: &dyn InputModel, compressed: &CompressedModel) -> PathBuf {
         let result = self.path("written");
         fs::create_dir(&result).unwrap();
-        model.write(reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
+        model.write(compressed, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
         result
     }
 }
@@ -171,11 +171,11 @@ fn proxy_moves_as_the_mean_of_its_members() {
     let model = open(&folder.path("result")).unwrap();
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.25), (2, 0.75)] };
     let reference = ReferenceFrame { frame: 2, extent: 10.0 };
-    let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
+    let proxies = model.compute_proxies(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
     assert!(proxies.deviation.is_some_and(|deviation| deviation < 1e-6), "{proxies:?}");
     let pruned = CompressedModel::pruned(vec![0, 1], &rule());
-    let reduction = CompressedModel { clusters: vec![cluster], proxies, ..pruned };
-    let left = open(&folder.written(&*model, &reduction)).unwrap();
+    let compressed = CompressedModel { clusters: vec![cluster], proxies, ..pruned };
+    let left = open(&folder.written(&*model, &compressed)).unwrap();
     for (left, whole) in states(&*left).iter().zip(states(&*model)) {
         let [a, b] = [0, 2].map(|row| whole.position.row::<3>(row));
         let got = left.position.row::<3>(0);

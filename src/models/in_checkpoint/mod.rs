@@ -149,14 +149,19 @@ impl<L: ProxyRule> CheckpointModel<L> {
     }
 
     /// Writes the compressed model to `path`: the checkpoint, and copies of the files beside it.
-    fn write_model(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
+    fn write_model(&self, compressed: &CompressedModel, path: &Path) -> Result<()> {
         for file in self.copied_files() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
         }
         let to = path.join(self.relative_path());
         let folder = to.parent().unwrap_or(path);
         fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
-        self.tensors.write(self.model.raw(), &motion_model::compressed_raw(self.model.raw(), reduction), reduction, &to)
+        self.tensors.write(
+            self.model.raw(),
+            &motion_model::compressed_raw(self.model.raw(), compressed),
+            compressed,
+            &to,
+        )
     }
 }
 
@@ -204,7 +209,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
             opening: 2 * whole,
             // A copy of the stored parameters and the values prepared from them.
             reader: whole + 128,
-            reduced: 2 * whole,
+            compressed: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             prepared: 0,
             // The training stores two optimizer values per parameter in addition.
@@ -255,7 +260,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         self.description.white_background.then_some([1.0; 3])
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         OutputKind::Model
     }
 
@@ -266,19 +271,19 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         }
     }
 
-    fn needs_all_bands(&self) -> Option<&'static str> {
+    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
         Some("loaders of the checkpoint expect coefficients of every degree")
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         motion_model::propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             L::propose(&self.model, clusters, rule)
         })
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
         let checkpoint = self.relative_path();
-        self.reopener()?.content(self, reduction, (self.own_output(), "model"), |name| {
+        self.reopener()?.content(self, compressed, (self.default_output_kind(), "model"), |name| {
             match Path::new(name) == checkpoint {
                 true => FileContent::Checkpoint(&self.tensors),
                 false => FileContent::Other,
@@ -290,26 +295,26 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         self.reopener()?.frames(content, &self.model.info().times)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.compressed_frames(reduction)))
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.compressed_frames(compressed)))
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
         if kind == OutputKind::Model {
-            return self.write_model(reduction, path).map(|()| Vec::new());
+            return self.write_model(compressed, path).map(|()| Vec::new());
         }
-        write_frames(&self.model, reduction, kind, path, limits.max_kept_frames, events)
+        write_frames(&self.model, compressed, kind, path, limits.max_kept_frames, events)
     }
 }
 
-/// Writes the compressed model `reduction` of `model` to `path` as `kind`, any kind of output except
+/// Writes the compressed model `compressed` of `model` to `path` as `kind`, any kind of output except
 /// [`OutputKind::Model`]. Returns notes for the user. What is written depends on `kind`:
 /// - A player format that can store the motion of the model: the motion.
 /// - Any other format: the states of the Gaussians at every frame. At most `held` frames are kept in memory.
@@ -318,19 +323,19 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 /// Fails if the format cannot hold the values or the file cannot be written.
 pub(super) fn write_frames<L: ProxyRule>(
     model: &MotionModelFrames<L>,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     kind: OutputKind,
     path: &Path,
     held: usize,
     events: &Events,
 ) -> Result<Vec<String>> {
-    match write_windowed(model, reduction, kind, path)? {
+    match write_windowed(model, compressed, kind, path)? {
         Some(notes) => Ok(notes),
-        None => write_sequence(&model.compressed_frames(reduction), kind, path, held, events),
+        None => write_sequence(&model.compressed_frames(compressed), kind, path, held, events),
     }
 }
 
-/// Writes the motion of the compressed model `reduction` of `model` to `path`, if `kind` is a player format that can
+/// Writes the motion of the compressed model `compressed` of `model` to `path`, if `kind` is a player format that can
 /// store this motion. Returns notes for the user. For any other `kind`, writes nothing and returns `None`; the caller
 /// then writes the states at the frames instead.
 ///
@@ -338,11 +343,11 @@ pub(super) fn write_frames<L: ProxyRule>(
 /// Fails if the format cannot hold the values or the file cannot be written.
 fn write_windowed<L: ProxyRule>(
     model: &MotionModelFrames<L>,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     kind: OutputKind,
     path: &Path,
 ) -> Result<Option<Vec<String>>> {
-    let raw = || motion_model::compressed_raw(model.raw(), reduction);
+    let raw = || motion_model::compressed_raw(model.raw(), compressed);
     let timed = if is_windowed(kind) { model.motion_model().timed(&raw()) } else { None };
     let Some(mut timed) = timed.filter(|timed| can_store(kind, timed.timeline)) else { return Ok(None) };
     timed.clip.frames = timed.clip.frames.or(Some(model.info().times.len()).filter(|&frames| frames > 0));

@@ -19,7 +19,7 @@ pub(in crate::models) enum RowElement {
     /// Component of an attribute: the attribute, and the index of the component in it.
     Attribute(Attributes, usize),
     /// Parameter with this index in [`StoredParams::format_specific`], which only this model format has.
-    Own(usize),
+    FormatSpecific(usize),
     /// Value that the states of Gaussians do not depend on.
     Unread,
 }
@@ -33,16 +33,16 @@ impl RowElement {
 
     /// Returns the meaning of `count` consecutive values in a tensor's row that are format-specific parameters: value k
     /// is the parameter with index `first` + k in [`StoredParams::format_specific`].
-    pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
-        (first..first + count).map(RowElement::Own).collect()
+    pub(in crate::models) fn format_specific(first: usize, count: usize) -> Vec<RowElement> {
+        (first..first + count).map(RowElement::FormatSpecific).collect()
     }
 
     /// Returns the values that `raw` holds for this element of a row, one per Gaussian; `None` for
     /// [`RowElement::Unread`].
     fn get(self, raw: &StoredParams) -> Option<&[f32]> {
         match self {
-            RowElement::Attribute(column, c) => Some(raw.gaussians.column(column).plane(c)),
-            RowElement::Own(c) => Some(raw.format_specific.plane(c)),
+            RowElement::Attribute(column, c) => Some(raw.gaussians.attribute_values(column).plane(c)),
+            RowElement::FormatSpecific(c) => Some(raw.format_specific.plane(c)),
             RowElement::Unread => None,
         }
     }
@@ -134,8 +134,10 @@ impl CheckpointReader {
         let width = elements.len();
         for (c, element) in elements.iter().enumerate() {
             let to = match *element {
-                RowElement::Attribute(column, plane) => self.raw.gaussians.column_mut(column).plane_mut(plane),
-                RowElement::Own(plane) => self.raw.format_specific.plane_mut(plane),
+                RowElement::Attribute(column, plane) => {
+                    self.raw.gaussians.attribute_values_mut(column).plane_mut(plane)
+                }
+                RowElement::FormatSpecific(plane) => self.raw.format_specific.plane_mut(plane),
                 RowElement::Unread => continue,
             };
             to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);
@@ -180,8 +182,8 @@ impl RowTensors {
         self.training_only.iter().map(|tensor| tensor.id)
     }
 
-    /// Writes the checkpoint of the compressed model `reduction` to `path`. `before` holds the parameters of the
-    /// original Gaussians, `raw_left` the parameters of the Gaussians of `reduction`. The row of a Gaussian is copied
+    /// Writes the checkpoint of the compressed model `compressed` to `path`. `before` holds the parameters of the
+    /// original Gaussians, `raw_left` the parameters of the Gaussians of `compressed`. The row of a Gaussian is copied
     /// byte for byte if its parameters are unchanged. In tensors that only the training reads, the rows of proxies
     /// (Gaussians that replace merged ones) become zero.
     ///
@@ -191,7 +193,7 @@ impl RowTensors {
         &self,
         before: &StoredParams,
         raw_left: &StoredParams,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         path: &Path,
     ) -> Result<()> {
         let mut rows = Vec::new();
@@ -204,7 +206,7 @@ impl RowTensors {
                     .any(|(raw_left, before)| raw_left[place].to_bits() != before[row as usize].to_bits())
             };
             let changed: Vec<u32> = (0u32..)
-                .zip(&reduction.kept)
+                .zip(&compressed.kept)
                 .filter(|&(place, &row)| differs(place as usize, row))
                 .map(|(place, _)| place)
                 .collect();
@@ -212,7 +214,7 @@ impl RowTensors {
             let stored = if unread { self.checkpoint.values(tensor, name)? } else { Vec::new() };
             let mut values = Vec::with_capacity(changed.len() * elements.len());
             for &place in &changed {
-                let row = reduction.kept[place as usize] as usize * elements.len();
+                let row = compressed.kept[place as usize] as usize * elements.len();
                 values.extend(pairs.iter().enumerate().map(|(c, pair)| match pair {
                     Some((raw_left, _)) => raw_left[place as usize],
                     None => stored[row + c],
@@ -220,7 +222,7 @@ impl RowTensors {
             }
             rows.push(GaussianRows { tensor: tensor.clone(), changed, values });
         }
-        let mut merged: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
+        let mut merged: Vec<u32> = compressed.clusters.iter().map(|cluster| cluster.output).collect();
         merged.sort_unstable();
         let training_only = self.training_only.iter();
         rows.extend(training_only.map(|tensor| GaussianRows {
@@ -228,6 +230,6 @@ impl RowTensors {
             changed: merged.clone(),
             values: Vec::new(),
         }));
-        write_like(&self.checkpoint, &reduction.kept, &rows, path)
+        write_like(&self.checkpoint, &compressed.kept, &rows, path)
     }
 }

@@ -37,7 +37,7 @@ use crate::model::SequenceInfo;
 use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
-use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadPlan, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadCounts, ReadPlan};
 use crate::tracking::Joiner;
 
 /// Opened frames whose Gaussians have been linked into tracks (Gaussians followed through frames).
@@ -114,12 +114,12 @@ impl FrameSource for LinkedFrames {
         self.container.open_all(wanted)
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.container.reads()
     }
 
-    fn ahead(&self) -> Option<&dyn Prefetch> {
-        self.container.ahead()
+    fn prefetcher(&self) -> Option<&dyn Prefetch> {
+        self.container.prefetcher()
     }
 }
 
@@ -186,15 +186,15 @@ impl InputModel for LinkedFrames {
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
-            OutputKind::PlySequence => self.write_files(reduction, path, events).map(|()| Vec::new()),
-            _ => write_trajectories(self, reduction, kind, path, limits, events),
+            OutputKind::PlySequence => self.write_files(compressed, path, events).map(|()| Vec::new()),
+            _ => write_trajectories(self, compressed, kind, path, limits, events),
         }
     }
 }

@@ -109,7 +109,7 @@ impl Steady {
             self.means.read(4 * width as u64 * u64::from(following[0]), bytemuck::cast_slice_mut(&mut read))?;
             for row in read.chunks_exact(width) {
                 let mut row = row.iter();
-                for column in values.columns_mut(STEADY_COLUMNS) {
+                for column in values.selected_attribute_values_mut(STEADY_COLUMNS) {
                     (0..column.width()).zip(&mut row).for_each(|(c, &value)| column.plane_mut(c)[at] = value);
                 }
                 at += 1;
@@ -127,7 +127,7 @@ impl HeldMeans {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
         for column in STEADY_COLUMNS.iter() {
             let held = places.iter().filter(|(at, _)| self.columns[*at].contains(column));
-            let (from, to) = (self.values.column(column), state.column_mut(column));
+            let (from, to) = (self.values.attribute_values(column), state.attribute_values_mut(column));
             for c in 0..to.width() {
                 let (from, to) = (from.plane(c), to.plane_mut(c));
                 held.clone().for_each(|&(at, row)| to[row] = from[at]);

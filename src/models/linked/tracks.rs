@@ -348,12 +348,12 @@ impl LinkedTracks {
             let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
             let rows: Vec<Vec<TrackedRow>> =
                 of_block.clone().map(|frame| self.rows(frame, 0..self.count)).collect::<Result<_>>()?;
-            let mut presence: Vec<BlockChange> = was_still
+            let mut changes: Vec<BlockChange> = was_still
                 .iter()
                 .map(|&still| if still { BlockChange::Repeating } else { BlockChange::Still })
                 .collect();
             for row in rows.iter().flatten() {
-                presence[row.track as usize / GAUSSIAN_BLOCK] = BlockChange::New;
+                changes[row.track as usize / GAUSSIAN_BLOCK] = BlockChange::New;
             }
             let info = SequenceInfo {
                 count: self.count,
@@ -362,13 +362,13 @@ impl LinkedTracks {
                 varying: Attributes::all(),
             };
             let block = FrameBlock { info, tracks: self, start, files: &files, rows: &rows, held: &held };
-            writer.append_with_presence(&block, 0..of_block.len(), &times[of_block.clone()], &presence)?;
+            writer.append_with_changes(&block, 0..of_block.len(), &times[of_block.clone()], &changes)?;
             for (frame, rows) in of_block.clone().zip(&rows) {
                 for row in rows {
                     held[row.track as usize] = TrackPosition { frame: frame as u32, row: row.row };
                 }
             }
-            was_still = presence.iter().map(|presence| *presence != BlockChange::New).collect();
+            was_still = changes.iter().map(|change| *change != BlockChange::New).collect();
             progress.advance(of_block.len() as u64);
         }
         writer.finish()
@@ -482,7 +482,7 @@ impl BlockReader for TrackReader<'_> {
             self.next += 1;
         }
         for column in want.iter() {
-            out.column_mut(column).clone_from(self.state.column(column));
+            out.attribute_values_mut(column).clone_from(self.state.attribute_values(column));
         }
         Ok(())
     }
@@ -492,7 +492,7 @@ impl BlockReader for TrackReader<'_> {
 /// `state` that it replaces.
 fn scatter(part: &Gaussians, places: impl Iterator<Item = (usize, usize)> + Clone, state: &mut Gaussians) {
     for column in Attributes::all().iter() {
-        let (from, to) = (part.column(column), state.column_mut(column));
+        let (from, to) = (part.attribute_values(column), state.attribute_values_mut(column));
         for c in 0..to.width() {
             let (from, to) = (from.plane(c), to.plane_mut(c));
             places.clone().for_each(|(row, place)| to[place] = from[row]);

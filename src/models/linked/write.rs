@@ -20,7 +20,7 @@ use crate::source::{FrameSource, Ids};
 const NO_ROW: u32 = u32::MAX;
 
 impl LinkedFrames {
-    /// Writes one PLY file per frame of the compressed model `reduction` into `folder`. Each Gaussian takes a row of
+    /// Writes one PLY file per frame of the compressed model `compressed` into `folder`. Each Gaussian takes a row of
     /// the input file of the frame:
     /// - A track (Gaussian followed through frames) keeps its row. If it has several Gaussians in the frame, they
     ///   become one, in the row of the first. Attributes that are constant along the track have their mean values.
@@ -30,9 +30,9 @@ impl LinkedFrames {
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
-    pub(super) fn write_files(&self, reduction: &CompressedModel, folder: &Path, events: &Events) -> Result<()> {
-        let (frames, result) = (self.tracks.frames(), merged(self, reduction));
-        let all = rows_of_model(reduction);
+    pub(super) fn write_files(&self, compressed: &CompressedModel, folder: &Path, events: &Events) -> Result<()> {
+        let (frames, result) = (self.tracks.frames(), merged(self, compressed));
+        let all = rows_of_model(compressed);
         let progress = events.task("emit", "frames", frames.paths().len() as u64);
         let write = |&frame: &usize| {
             let mut of_frame = self.tracks.rows(frame, 0..self.tracks.count())?;
@@ -46,15 +46,15 @@ impl LinkedFrames {
             };
             let (mut rows, mut written, mut merged, mut computed) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
             for (place, row) in all.iter().enumerate() {
-                let members = row.proxy.map_or(&[][..], |proxy| &reduction.clusters[proxy as usize].members[..]);
-                let tracks = [row.source].into_iter().chain(members.iter().map(|member| member.0));
-                if let Some(source) = tracks.map(|track| row_of[track as usize]).find(|&row| row != NO_ROW) {
+                let members = row.proxy.map_or(&[][..], |proxy| &compressed.clusters[proxy as usize].members[..]);
+                let tracks = [row.template_row].into_iter().chain(members.iter().map(|member| member.0));
+                if let Some(template_row) = tracks.map(|track| row_of[track as usize]).find(|&row| row != NO_ROW) {
                     if row.proxy.is_some() {
                         merged.push(rows.len());
-                    } else if is_computed(row.source) {
+                    } else if is_computed(row.template_row) {
                         computed.push(rows.len());
                     }
-                    rows.push(OutputRow { source, proxy: None });
+                    rows.push(OutputRow { template_row, proxy: None });
                     written.push(place as u32);
                 }
             }
@@ -63,7 +63,7 @@ impl LinkedFrames {
             let mut first = Gaussians::zeros(0, self.info.sh_degree);
             result.open(Ids::List(&places))?.read(frame, Attributes::all(), &mut first)?;
             of_frame.retain(|row| {
-                computed.binary_search_by_key(&row.track, |&at| all[written[at] as usize].source).is_ok()
+                computed.binary_search_by_key(&row.track, |&at| all[written[at] as usize].template_row).is_ok()
             });
             let mut proxies = Gaussians::zeros(merged.len() + computed.len(), self.info.sh_degree);
             proxies.write_rows(0, &first);
@@ -71,9 +71,9 @@ impl LinkedFrames {
             for (proxy, at) in merged.into_iter().chain(computed).enumerate() {
                 rows[at].proxy = Some(proxy as u32);
             }
-            let change = reduction.delta_at(frame, frames.paths().len()).pick(&written);
+            let change = compressed.delta_at(frame, frames.paths().len()).pick(&written);
             let name = template.path().file_name().unwrap_or_default();
-            write_like_template(&template, &rows, &proxies, &change, reduction.sh_degree, &folder.join(name))?;
+            write_like_template(&template, &rows, &proxies, &change, compressed.sh_degree, &folder.join(name))?;
             progress.advance(1);
             Ok(())
         };

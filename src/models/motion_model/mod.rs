@@ -18,7 +18,7 @@ use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
 use crate::source::{
-    BlockReader, Deformation, DeformedGaussians, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads, SharedCounter,
+    BlockReader, Deformation, DeformedGaussians, FeatureDecoder, FrameSource, Ids, ReadCounts, ReadPlan, SharedCounter,
 };
 
 pub(super) use proxies::propose_proxies;
@@ -148,9 +148,9 @@ impl<L: MotionModel> MotionModelFrames<L> {
         }
     }
 
-    /// Returns the frames of the compressed model that `reduction` describes.
-    pub(super) fn compressed_frames(&self, reduction: &CompressedModel) -> MotionModelFrames<L> {
-        self.with_raw(compressed_raw(&self.raw, reduction))
+    /// Returns the frames of the compressed model that `compressed` describes.
+    pub(super) fn compressed_frames(&self, compressed: &CompressedModel) -> MotionModelFrames<L> {
+        self.with_raw(compressed_raw(&self.raw, compressed))
     }
 
     /// Returns the time of frame `frame`; fails if the frame does not exist.
@@ -161,25 +161,25 @@ impl<L: MotionModel> MotionModelFrames<L> {
     }
 }
 
-/// Returns the stored parameters of the compressed model `reduction` of `raw`: Gaussians are removed, proxies
+/// Returns the stored parameters of the compressed model `compressed` of `raw`: Gaussians are removed, proxies
 /// (Gaussians that replace merged ones) put in place of their leaders (the most important members of the clusters),
 /// parameter deltas added, and the SH degree lowered.
-pub(super) fn compressed_raw(raw: &StoredParams, reduction: &CompressedModel) -> StoredParams {
-    let mut raw_left = raw.pick(&reduction.kept);
-    if let Some(proxies) = &reduction.proxies.raw {
-        for (proxy, cluster) in reduction.clusters.iter().enumerate() {
+pub(super) fn compressed_raw(raw: &StoredParams, compressed: &CompressedModel) -> StoredParams {
+    let mut raw_left = raw.pick(&compressed.kept);
+    if let Some(proxies) = &compressed.proxies.raw {
+        for (proxy, cluster) in compressed.clusters.iter().enumerate() {
             raw_left.set_row(cluster.output as usize, proxies, proxy);
         }
     }
-    raw_left.gaussians.truncate_sh(reduction.sh_degree);
-    reduction.delta.add_to(&mut raw_left.gaussians, Attributes::all());
+    raw_left.gaussians.truncate_sh(compressed.sh_degree);
+    compressed.delta.add_to(&mut raw_left.gaussians, Attributes::all());
     raw_left
 }
 
 /// Copies the stored attributes `want` of all Gaussians of `raw` to `out`.
 pub(super) fn copy_stored(raw: &StoredParams, want: Attributes, out: &mut Gaussians) {
     for column in want.iter() {
-        let (from, to) = (raw.gaussians.column(column), out.column_mut(column));
+        let (from, to) = (raw.gaussians.attribute_values(column), out.attribute_values_mut(column));
         (0..to.width()).for_each(|c| to.plane_mut(c).copy_from_slice(from.plane(c)));
     }
 }
@@ -216,8 +216,8 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
         self.motion_model.shading().is_some().then_some(self as &dyn FeatureDecoder)
     }
 
-    fn reads(&self) -> Reads {
-        Reads { states: self.states.get(), ..Reads::default() }
+    fn reads(&self) -> ReadCounts {
+        ReadCounts { states: self.states.get(), ..ReadCounts::default() }
     }
 }
 
@@ -249,7 +249,7 @@ impl<L: MotionModel> PreparedBlock<L> {
     /// Computes the attributes `want` of the states at `time` into `out`, using AVX2 instructions if the processor has
     /// them.
     fn state(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {
-        out.columns_mut(want).for_each(|column| column.resize(self.raw.len()));
+        out.selected_attribute_values_mut(want).for_each(|column| column.resize(self.raw.len()));
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2, as the condition above checked.

@@ -32,7 +32,7 @@ impl MotionModel for Straight {
         out: &mut Gaussians,
     ) -> Result<()> {
         for column in want.iter() {
-            *out.column_mut(column) = raw.gaussians.column(column).clone();
+            *out.attribute_values_mut(column) = raw.gaussians.attribute_values(column).clone();
         }
         if want.contains(Attributes::POSITION) {
             for c in 0..3 {
@@ -55,7 +55,7 @@ fn model() -> MotionModelFrames<Straight> {
     let noise = |column: &mut AttributeValues, step: f32| {
         column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract());
     };
-    raw.gaussians.columns_mut(Attributes::all()).for_each(|column| noise(column, 0.618_034));
+    raw.gaussians.selected_attribute_values_mut(Attributes::all()).for_each(|column| noise(column, 0.618_034));
     noise(&mut raw.format_specific, 0.754_878);
     MotionModelFrames::new(Straight, raw, 0).with_times(vec![0.0, 0.5, 2.0]).unwrap()
 }
@@ -83,13 +83,13 @@ fn every_reader_returns_the_same_bits() {
 #[test]
 fn compressed_model_has_survivors_proxies_and_deltas() {
     let (model, rule) = (model(), Recipe::preset("default").unwrap().merge);
-    let mut reduction = CompressedModel::pruned(vec![3, 8, 11], &rule);
-    reduction.clusters.push(Cluster { output: 1, leader: 8, members: vec![(8, 0.5), (9, 0.5)] });
-    reduction.proxies.raw = Some(model.raw().pick(&[20]));
+    let mut compressed = CompressedModel::pruned(vec![3, 8, 11], &rule);
+    compressed.clusters.push(Cluster { output: 1, leader: 8, members: vec![(8, 0.5), (9, 0.5)] });
+    compressed.proxies.raw = Some(model.raw().pick(&[20]));
     let mut by = Gaussians { position: AttributeValues::zeros(3, 3), ..Gaussians::default() };
     by.position.set_row(2, [1.0, 0.0, 0.0]);
-    reduction.delta = ParamDelta(by);
-    let reduced = model.compressed_frames(&reduction);
+    compressed.delta = ParamDelta(by);
+    let reduced = model.compressed_frames(&compressed);
     let mut expected = model.raw().pick(&[3, 20, 11]);
     expected.gaussians.position.plane_mut(0)[2] += 1.0;
     assert_eq!(reduced.raw(), &expected);

@@ -221,7 +221,7 @@ impl MotionModel for Native {
                 let exponent = rate * (time - f64::from(center)).powi(2);
                 if exponent > log_cutoff { slope(inverse_odds, exponent) as f32 } else { 0.0 }
             });
-            *jacobian.column_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes.collect());
+            *jacobian.derivative_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes.collect());
         }
         Ok(jacobian)
     }

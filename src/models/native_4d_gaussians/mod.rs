@@ -24,7 +24,7 @@ use crate::compressed_model::Cluster;
 use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, Node, NodeId, Pickle};
 use crate::limits::ReadLimit;
-use crate::model::{Attributes, StoredParams, sh_coefficients};
+use crate::model::{Attributes, StoredParams, sh_coefficient_count};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions, TrainingConventions};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
@@ -213,9 +213,9 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     let training_nodes = training_nodes(pickle, &parts, is_4d);
     let terms = motion_model.as_ref().map_or(0, |motion_model| motion_model.terms);
     let own = if is_4d { TERMS + TERM_WIDTH * terms } else { 0 };
-    let bands = sh_coefficients(degree);
+    let bands = sh_coefficient_count(degree);
     let mut rest_elements = RowElement::all_of(Attributes::SH, 3, 3 * (bands - 1));
-    rest_elements.extend(RowElement::own(TERMS, TERM_WIDTH * terms));
+    rest_elements.extend(RowElement::format_specific(TERMS, TERM_WIDTH * terms));
     rest_elements.resize(3 * (coefficients - 1), RowElement::Unread);
     let mut reader = CheckpointReader::new(checkpoint, count, degree, own)?;
     let mut read = |i: usize, name: &str, row: &[usize], planes| {
@@ -229,10 +229,10 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     read(5, "rotation", &[4], RowElement::all_of(Attributes::ROTATION, 0, 4))?;
     read(6, "opacity", &[1], RowElement::all_of(Attributes::OPACITY, 0, 1))?;
     if let Some(motion_model) = &motion_model {
-        read(13, "t", &[1], RowElement::own(TIME, 1))?;
-        read(14, "scaling_t", &[1], RowElement::own(SCALING_T, 1))?;
+        read(13, "t", &[1], RowElement::format_specific(TIME, 1))?;
+        read(14, "scaling_t", &[1], RowElement::format_specific(SCALING_T, 1))?;
         if motion_model.has_4d_rotation {
-            read(15, "rotation_r", &[4], RowElement::own(ROTATION_R, 4))?;
+            read(15, "rotation_r", &[4], RowElement::format_specific(ROTATION_R, 4))?;
         }
     }
     training_nodes.into_iter().for_each(|id| reader.add_training_tensor(id));

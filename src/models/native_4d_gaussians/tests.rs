@@ -101,11 +101,11 @@ impl CheckpointFolder {
         root
     }
 
-    fn written(&self, model: &dyn InputModel, reduction: &CompressedModel) -> PathBuf {
+    fn written(&self, model: &dyn InputModel, compressed: &CompressedModel) -> PathBuf {
         let result = self.path("result");
         _ = fs::remove_dir_all(&result);
         fs::create_dir(&result).unwrap();
-        model.write(reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
+        model.write(compressed, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
         result
     }
 }
@@ -259,16 +259,16 @@ fn written_proxies_and_deltas_read_back() {
     let model = open(&folder.put(parts));
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.6), (1, 0.4)] };
     let reference = ReferenceFrame { frame: 2, extent: 10.0 };
-    let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
+    let proxies = model.compute_proxies(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
     assert!(proxies.refused.is_empty(), "{proxies:?}");
     let pruned = CompressedModel::pruned(vec![0, 3, 4], &rule());
     let mut by = Gaussians::zeros(3, 0);
     by.position.set_row(2, [0.5, 0.0, -0.25]);
     by.sh.set_row(1, [0.1, 0.2, 0.0]);
     let by = Gaussians { rotation: Default::default(), log_scale: Default::default(), ..by };
-    let reduction = CompressedModel { clusters: vec![cluster], proxies, delta: ParamDelta(by), ..pruned };
-    let shown = model.reduced(&reduction).unwrap();
-    let result = folder.written(&*model, &reduction);
+    let compressed = CompressedModel { clusters: vec![cluster], proxies, delta: ParamDelta(by), ..pruned };
+    let shown = model.compressed_frames(&compressed).unwrap();
+    let result = folder.written(&*model, &compressed);
     let whole = states(&*model);
     for (frame, state) in states(&*open(&result)).iter().enumerate() {
         assert_eq!(*state, gather_all(&*shown, frame, Attributes::all()).unwrap());

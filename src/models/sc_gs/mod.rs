@@ -281,17 +281,17 @@ impl MotionModel for NodeMotion {
         let motion = self.motion(time, prepared, want)?;
         copy_stored(raw, want, out);
         for column in want.iter() {
-            let to = out.column_mut(column);
+            let to = out.attribute_values_mut(column);
             match column {
                 Attributes::POSITION => add_planes(&motion.warp, to),
                 Attributes::ROTATION => add_planes(&motion.rotation, to),
-                Attributes::LOG_SCALE => each(&motion.scaling, to, |log, by| {
+                Attributes::LOG_SCALE => update_each(&motion.scaling, to, |log, by| {
                     let log = f64::from(log);
                     let log = if log > MAX_LOG_SCALE { MAX_LOG_SCALE } else { log };
                     let log = if log < -MAX_LOG_SCALE { -MAX_LOG_SCALE } else { log };
                     ln((exp(log) + f64::from(by)).abs().max(MIN_SCALE)) as f32
                 }),
-                Attributes::OPACITY => each(&motion.opacity, to, |logit, by| add_to_opacity(logit, by) as f32),
+                Attributes::OPACITY => update_each(&motion.opacity, to, |logit, by| add_to_opacity(logit, by) as f32),
                 _ => add_planes(&motion.color, to),
             }
         }
@@ -302,7 +302,7 @@ impl MotionModel for NodeMotion {
         let mut found = Jacobian::default();
         let motion = self.motion(time, prepared, want.difference(Attributes::POSITION))?;
         if want.contains(Attributes::POSITION) {
-            *found.column_mut(Attributes::POSITION) = match &self.nodes {
+            *found.derivative_mut(Attributes::POSITION) = match &self.nodes {
                 Some(sparse) => position_slopes(sparse, &self.network, raw, time)?,
                 None => {
                     let mut slopes = self.network.warp_jacobian(&raw.gaussians.position, time)?;
@@ -321,16 +321,16 @@ impl MotionModel for NodeMotion {
                     *out = if (own + by).abs() > MIN_SCALE { (own / (own + by)) as f32 } else { 0.0 };
                 }
             }
-            *found.column_mut(Attributes::LOG_SCALE) = out;
+            *found.derivative_mut(Attributes::LOG_SCALE) = out;
         }
         if want.contains(Attributes::OPACITY) && !motion.opacity.is_empty() {
             let mut out = raw.gaussians.opacity_logit.clone();
-            each(&motion.opacity, &mut out, |logit, by| {
+            update_each(&motion.opacity, &mut out, |logit, by| {
                 let (own, state) = (opacity(logit), add_to_opacity(logit, by));
                 let whole = opacity(state as f32);
                 if state.abs() < MAX_LOGIT { (own * (1.0 - own) / (whole * (1.0 - whole))) as f32 } else { 0.0 }
             });
-            *found.column_mut(Attributes::OPACITY) = out;
+            *found.derivative_mut(Attributes::OPACITY) = out;
         }
         Ok(found)
     }
@@ -338,13 +338,13 @@ impl MotionModel for NodeMotion {
 
 /// Adds each plane of `by` (one component of all Gaussians) to the same plane of `to`. Does nothing if `by` is empty.
 fn add_planes(by: &AttributeValues, to: &mut AttributeValues) {
-    each(by, to, |value, by| value + by);
+    update_each(by, to, |value, by| value + by);
 }
 
 /// Replaces each value v of `to` by `f(v, b)`, where b is the value of `by` for the same component and Gaussian.
 /// Components that `by` lacks stay unchanged.
 #[inline(always)]
-fn each(by: &AttributeValues, to: &mut AttributeValues, f: impl Fn(f32, f32) -> f32) {
+fn update_each(by: &AttributeValues, to: &mut AttributeValues, f: impl Fn(f32, f32) -> f32) {
     for c in 0..by.width().min(to.width()) {
         to.plane_mut(c).iter_mut().zip(by.plane(c)).for_each(|(value, &by)| *value = f(*value, by));
     }

@@ -7,7 +7,7 @@
 use std::path::Path;
 
 use super::decoder::ColorActivation;
-use super::frame_state::{FEATURES, FULL_PARAM_COUNT, MOTION, OMEGA, SHARED_PARAM_COUNT};
+use super::frame_state::{FIRST_FEATURE, FULL_PARAM_COUNT, MOTION, OMEGA, SHARED_PARAM_COUNT};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply::write::{put, rows_of_model, value, write_rows_like};
@@ -96,7 +96,9 @@ impl PointCloudFile {
                 PlaneSource::Property(property) => property.name.as_str(),
                 PlaneSource::Thin => "scale_2",
             });
-            names.enumerate().try_for_each(|(c, name)| self.check(name, raw.gaussians.column(column).plane(c)))?;
+            names
+                .enumerate()
+                .try_for_each(|(c, name)| self.check(name, raw.gaussians.attribute_values(column).plane(c)))?;
         }
         for (plane, property) in self.own.iter().enumerate() {
             self.check(&property.name, raw.format_specific.plane(plane))?;
@@ -133,10 +135,10 @@ impl PointCloudFile {
     ///
     /// # Errors
     /// Fails if the file was cut short since it was opened or a write fails.
-    pub(super) fn write(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
-        let (layout, rows) = (self.ply.layout(), rows_of_model(reduction));
+    pub(super) fn write(&self, compressed: &CompressedModel, path: &Path) -> Result<()> {
+        let (layout, rows) = (self.ply.layout(), rows_of_model(compressed));
         let big_endian = self.ply.header().encoding == PlyEncoding::BigEndian;
-        let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.delta.0);
+        let (proxies, by) = (compressed.proxies.raw.as_ref(), &compressed.delta.0);
         let places = |column: Attributes| layout.planes(column).iter().enumerate();
         let columns: Vec<Attributes> =
             Attributes::all().iter().filter(|&of| of != Attributes::SH || !self.is_full()).collect();
@@ -145,22 +147,23 @@ impl PointCloudFile {
         let color_offset = |column: Attributes| if column == Attributes::SH { 0.5 } else { 0.0 };
         write_rows_like(
             &self.ply,
-            &reduction.kept,
+            &compressed.kept,
             |name| Some(name.to_owned()),
             path,
             |place, bytes| {
                 for &column in &columns {
                     for (c, plane) in places(column) {
                         let PlaneSource::Property(property) = plane else { continue };
-                        let change =
-                            Some(by.column(column)).filter(|by| !by.is_empty()).map_or(0.0, |by| by.plane(c)[place]);
+                        let change = Some(by.attribute_values(column))
+                            .filter(|by| !by.is_empty())
+                            .map_or(0.0, |by| by.plane(c)[place]);
                         let proxy = rows[place].proxy.zip(proxies);
                         if proxy.is_none() && change == 0.0 {
                             continue;
                         }
                         let before = match proxy {
                             Some((proxy, raw)) => {
-                                let stored = f64::from(raw.gaussians.column(column).plane(c)[proxy as usize]);
+                                let stored = f64::from(raw.gaussians.attribute_values(column).plane(c)[proxy as usize]);
                                 color_offset(column) + color_scale(column) * stored
                             }
                             None => f64::from(value(bytes, property, big_endian)),
@@ -200,9 +203,9 @@ fn own_property_names(is_full: bool) -> Vec<String> {
 /// - Lite model (`None`): `raw` holds the stored colors in place of SH coefficients, and the function converts them.
 fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
-        let features = raw.format_specific.width() > FEATURES;
+        let features = raw.format_specific.width() > FIRST_FEATURE;
         let from: Vec<f32> =
-            if features { raw.format_specific.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
+            if features { raw.format_specific.plane(FIRST_FEATURE + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
         let color = |x: f32| activation.map_or(f64::from(x), |activation| activation.apply(f64::from(x)));
         raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = sh_from_color(color(x)));
     }

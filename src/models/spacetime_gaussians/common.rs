@@ -16,7 +16,7 @@ pub(super) fn memory_profile(param_count: usize) -> MemoryProfile {
         opening: whole,
         // A copy of the stored parameters with the values prepared from them.
         reader: whole + 16 + 8,
-        reduced: 2 * whole,
+        compressed: 2 * whole,
         jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
         prepared: 0,
         file: whole + 24,

@@ -10,7 +10,7 @@ use crate::deform::Tensors;
 use crate::error::{Error, Result, quoted};
 
 /// Number of features of a Gaussian, which the renderer blends for each pixel.
-pub(super) const FEATURES: usize = 9;
+pub(super) const FEATURE_COUNT: usize = 9;
 /// Number of network inputs: features 3 to 8, camera center (3 values) and ray (3 values).
 const INPUTS: usize = 12;
 /// Number of units in the hidden layer of the network.
@@ -94,8 +94,8 @@ impl ColorDecoder {
         })
     }
 
-    /// Returns the color of a pixel with blended `features` ([`FEATURES`] values), seen from the camera center `center`
-    /// along the unit vector `ray`.
+    /// Returns the color of a pixel with blended `features` ([`FEATURE_COUNT`] values), seen from the camera center
+    /// `center` along the unit vector `ray`.
     pub(super) fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
         let mut inputs = [0.0; INPUTS];
         let all = features[3..].iter().chain(&center).chain(&ray);

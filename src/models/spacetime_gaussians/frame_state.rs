@@ -24,7 +24,7 @@ pub(super) const OMEGA: usize = 11;
 pub(super) const SHARED_PARAM_COUNT: usize = 15;
 /// First of six indices in [`StoredParams::format_specific`] of the full model: features that are constant in time. The
 /// first three are a color before the last function ([`ColorActivation`](super::decoder::ColorActivation)) is applied.
-pub(super) const FEATURES: usize = 15;
+pub(super) const FIRST_FEATURE: usize = 15;
 /// First of three indices in [`StoredParams::format_specific`] of the full model: factors of dt, which give the
 /// features that are proportional to the time dt since the center of the temporal window.
 pub(super) const FEATURES_IN_TIME: usize = 21;
@@ -167,7 +167,7 @@ impl MotionModel for Spacetime {
                 let dt = time - f64::from(centers[row]);
                 slope(prepared.inverse_odds[row], window_exponent(dt, prepared.inverse_squared[row])) as f32
             };
-            *found.column_mut(Attributes::OPACITY) =
+            *found.derivative_mut(Attributes::OPACITY) =
                 AttributeValues::from_planes(1, (0..raw.len()).map(derivative).collect());
         }
         Ok(found)
@@ -182,14 +182,14 @@ impl Shading for Spacetime {
     /// Returns nine features for each Gaussian of `raw` at `time`: six that are constant in time, then three that are
     /// proportional to the time since the center of the temporal window.
     fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues {
-        let mut found = AttributeValues::zeros(decoder::FEATURES, raw.len());
+        let mut found = AttributeValues::zeros(decoder::FEATURE_COUNT, raw.len());
         let centers = raw.format_specific.plane(CENTER);
-        for plane in 0..FEATURES_IN_TIME - FEATURES {
-            found.plane_mut(plane).copy_from_slice(raw.format_specific.plane(FEATURES + plane));
+        for plane in 0..FEATURES_IN_TIME - FIRST_FEATURE {
+            found.plane_mut(plane).copy_from_slice(raw.format_specific.plane(FIRST_FEATURE + plane));
         }
         for c in 0..FULL_PARAM_COUNT - FEATURES_IN_TIME {
             let by_time = raw.format_specific.plane(FEATURES_IN_TIME + c);
-            for (row, to) in found.plane_mut(FEATURES_IN_TIME - FEATURES + c).iter_mut().enumerate() {
+            for (row, to) in found.plane_mut(FEATURES_IN_TIME - FIRST_FEATURE + c).iter_mut().enumerate() {
                 *to = ((time - f64::from(centers[row])) * f64::from(by_time[row])) as f32;
             }
         }

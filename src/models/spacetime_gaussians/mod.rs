@@ -210,11 +210,11 @@ impl SpacetimeGaussians {
     }
 
     /// Writes the compressed model as a model folder at `path`.
-    fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
+    fn write_folder(&self, compressed: &CompressedModel, path: &Path) -> Result<()> {
         let number = self.files.folder.as_ref().map_or(0, |(_, number)| *number);
         let folder = path.join(POINT_CLOUD_FOLDER).join(format!("iteration_{number}"));
         fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
-        self.cloud.write(reduction, &folder.join(POINT_CLOUD_FILE))?;
+        self.cloud.write(compressed, &folder.join(POINT_CLOUD_FILE))?;
         if let Some(decoder) = &self.files.decoder {
             copy(decoder, &folder.join(DECODER))?;
         }
@@ -310,7 +310,7 @@ impl InputModel for SpacetimeGaussians {
         Some([0.0; 3])
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         if self.files.folder.is_some() { OutputKind::Model } else { OutputKind::Ply }
     }
 
@@ -323,48 +323,56 @@ impl InputModel for SpacetimeGaussians {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule, self.activation)
         })
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, reduction, (self.own_output(), "model.ply"), FileContent::from_name)
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener.content(self, compressed, (self.default_output_kind(), "model.ply"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.reopener.frames(content, &self.model.info().times)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.compressed_frames(reduction)))
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.compressed_frames(compressed)))
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
-            OutputKind::Model => self.write_folder(reduction, path)?,
-            OutputKind::Ply => self.cloud.write(reduction, path)?,
+            OutputKind::Model => self.write_folder(compressed, path)?,
+            OutputKind::Ply => self.cloud.write(compressed, path)?,
             OutputKind::Splatv => {
-                let raw = compressed_raw(self.model.raw(), reduction);
+                let raw = compressed_raw(self.model.raw(), compressed);
                 // Keep the stored color where it did not change: converting it to SH and back can change its last
                 // digit.
                 let (own, colors) = (&self.model.raw().gaussians.sh, self.cloud.colors()?);
                 let known = |i: usize| {
-                    let id = reduction.kept[i] as usize;
+                    let id = compressed.kept[i] as usize;
                     let is_own = raw.gaussians.sh.row::<3>(i) == own.row::<3>(id);
                     is_own.then(|| colors.each_ref().map(|plane| plane[id]))
                 };
                 splatv::write(&raw, known, self.files.root_file(CAMERAS).as_deref(), path)?;
             }
-            _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events),
+            _ => {
+                return write_sequence(
+                    &*self.compressed_frames(compressed)?,
+                    kind,
+                    path,
+                    limits.max_kept_frames,
+                    events,
+                );
+            }
         }
         Ok(Vec::new())
     }

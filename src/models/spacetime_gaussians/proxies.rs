@@ -11,12 +11,12 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::decoder::ColorActivation;
-use super::frame_state::{FEATURES, FULL_PARAM_COUNT, SHARED_PARAM_COUNT, Spacetime};
+use super::frame_state::{FIRST_FEATURE, FULL_PARAM_COUNT, SHARED_PARAM_COUNT, Spacetime};
 use super::motion::{SpacetimeMotion, TargetState, dot, fitted, mean, merged_window, product};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::merging::moments::{WeightedGaussian, align_axes, moments};
-use crate::merging::proxy::merge_state;
+use crate::merging::moments::{WeightedGaussian, moments, reorder_axes_to_match};
+use crate::merging::proxy::merge_member_states;
 use crate::model::{Attributes, Gaussians, StoredParams, opacity, sh_from_color};
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
@@ -135,7 +135,7 @@ fn proxy_parameters(
                 average(&members, members.raw.format_specific.plane(plane)) as f32;
         }
         for c in 0..3 {
-            let feature = f64::from(out.format_specific.plane(FEATURES + c)[0]);
+            let feature = f64::from(out.format_specific.plane(FIRST_FEATURE + c)[0]);
             out.gaussians.sh.plane_mut(c)[0] = sh_from_color(activation.apply(feature));
         }
     }
@@ -211,7 +211,7 @@ fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], moti
     }
     let total: f64 = parts.iter().map(|part| part.weight).sum();
     parts.iter_mut().for_each(|part| part.weight /= total);
-    let found = align_axes(&moments(&parts, Some(DVec3::ZERO)), DQuat::IDENTITY);
+    let found = reorder_axes_to_match(&moments(&parts, Some(DVec3::ZERO)), DQuat::IDENTITY);
     let turn = [found.rotation.w, found.rotation.x, found.rotation.y, found.rotation.z];
     // The product of two quaternions is linear in each factor, so the quaternion stays linear in time.
     (motion.rotation, motion.omega) = (product(motion.rotation, turn), product(motion.omega, turn));
@@ -237,7 +237,7 @@ fn amplitude(
 ) -> f64 {
     let (mut of, mut by) = (0.0, 0.0);
     for (state, &time) in states.iter().zip(times) {
-        let merged = merge_state(&members.rows, state, members.leader, rule, Attributes::OPACITY);
+        let merged = merge_member_states(&members.rows, state, members.leader, rule, Attributes::OPACITY);
         let window = motion.window(time);
         of += window * opacity(merged.opacity_logit as f32);
         by += window * window;

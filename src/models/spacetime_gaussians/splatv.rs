@@ -210,7 +210,7 @@ impl InputModel for SplatvModel {
         Some([0.0; 3])
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         OutputKind::Splatv
     }
 
@@ -224,44 +224,44 @@ impl InputModel for SplatvModel {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule, ColorActivation::None)
         })
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, reduction, (self.own_output(), "model.splatv"), FileContent::from_name)
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener.content(self, compressed, (self.default_output_kind(), "model.splatv"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.reopener.frames(content, &self.model.info().times)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.compressed_frames(reduction)))
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.compressed_frames(compressed)))
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
         if kind != OutputKind::Splatv {
-            return write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events);
+            return write_sequence(&*self.compressed_frames(compressed)?, kind, path, limits.max_kept_frames, events);
         }
         self.file.check()?;
-        let raw = compressed_raw(self.model.raw(), reduction);
-        let unchanged = self.model.raw().pick(&reduction.kept);
+        let raw = compressed_raw(self.model.raw(), compressed);
+        let unchanged = self.model.raw().pick(&compressed.kept);
         let words_of = |i: usize| {
             let (now, before) = (to_row(&raw, i), to_row(&unchanged, i));
             if now != before {
                 return encode_words(&now);
             }
-            let mut stored = self.file.words(file_row(self.rows.as_deref(), reduction.kept[i] as usize));
+            let mut stored = self.file.words(file_row(self.rows.as_deref(), compressed.kept[i] as usize));
             repair_words(&mut stored);
             stored
         };

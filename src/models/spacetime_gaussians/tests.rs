@@ -101,7 +101,7 @@ fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
 fn assert_near(found: &[Gaussians], expected: &[Gaussians], tolerance: f32) {
     for (found, expected) in found.iter().zip(expected) {
         for column in Attributes::all().iter() {
-            let pairs = found.column(column).planes().iter().zip(expected.column(column).planes());
+            let pairs = found.attribute_values(column).planes().iter().zip(expected.attribute_values(column).planes());
             pairs.for_each(|(a, b)| assert!((a - b).abs() <= tolerance, "{}: {a}, expected {b}", column.name()));
         }
     }
@@ -180,11 +180,11 @@ fn opacity_jacobian_agrees_with_finite_differences() {
     };
     for frame in 0..TIMES.len() {
         let found = deformation.with_params(deformation.stored()).jacobian(frame, Attributes::all()).unwrap();
-        assert_eq!(found.column(Attributes::POSITION).width(), 0);
+        assert_eq!(found.derivative(Attributes::POSITION).width(), 0);
         let (more, less) = (at(frame, step), at(frame, -step));
         for i in 0..COUNT {
             let expected = (more.plane(0)[i] - less.plane(0)[i]) / (2.0 * step);
-            let found = found.column(Attributes::OPACITY).plane(0)[i];
+            let found = found.derivative(Attributes::OPACITY).plane(0)[i];
             assert!((found - expected).abs() < 1e-3, "{found} for {expected}");
         }
     }
@@ -205,8 +205,8 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
         let model = open_with_frames(root.path());
         let rule = Recipe::preset("default").unwrap().merge;
         let result = tempfile::tempdir().unwrap();
-        let reduction = CompressedModel::pruned(vec![1, 4, 5], &rule);
-        model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
+        let compressed = CompressedModel::pruned(vec![1, 4, 5], &rule);
+        model.write(&compressed, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
         let kept = |name: &str, i: usize| value(name, [1, 4, 5][i]);
         let iteration = result.path().join("point_cloud/iteration_300");
         assert_eq!(fs::read(iteration.join(POINT_CLOUD_FILE)).unwrap(), ply(&properties(is_full), 3, kept));
@@ -223,10 +223,10 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
         assert!(size.total() < model.bytes().unwrap() && size.rest > 0);
         // The PLY alone, as viewers open it.
         let alone = result.path().join("alone.ply");
-        model.write(&reduction, OutputKind::Ply, &alone, &Limits::NONE, &Events::IGNORED).unwrap();
+        model.write(&compressed, OutputKind::Ply, &alone, &Limits::NONE, &Events::IGNORED).unwrap();
         assert_eq!(fs::read(&alone).unwrap(), fs::read(iteration.join(POINT_CLOUD_FILE)).unwrap());
         let alone = open_with_frames(&alone);
-        assert_eq!((alone.own_output(), alone.kind()), (OutputKind::Ply, model.kind()));
+        assert_eq!((alone.default_output_kind(), alone.kind()), (OutputKind::Ply, model.kind()));
         assert_eq!(alone.check_output(OutputKind::Splatv, Path::new("x.splatv")).is_err(), is_full);
         assert!(alone.check_output(OutputKind::Model, Path::new("x")).is_err());
     }
@@ -234,11 +234,11 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
 
 /// Returns a compressed model of three Gaussians: one is a proxy (it replaces two merged Gaussians), and each has a
 /// parameter delta (change that refinement adds to its parameters).
-fn reduction(model: &dyn InputModel) -> CompressedModel {
+fn compressed(model: &dyn InputModel) -> CompressedModel {
     let rule = MergeParams { max_drift: 1e6, ..Recipe::preset("default").unwrap().merge };
     let cluster = Cluster { output: 1, leader: 3, members: vec![(2, 0.25), (3, 0.75)] };
     let reference = ReferenceFrame { frame: 0, extent: 1.0 };
-    let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule).unwrap();
+    let proxies = model.compute_proxies(std::slice::from_ref(&cluster), reference, &rule).unwrap();
     let mut by = Gaussians::zeros(3, 0);
     by.position.set_row(0, [0.5, 0.0, -0.25]);
     by.opacity_logit.set_row(0, [0.5]);
@@ -262,10 +262,10 @@ fn written_proxies_and_deltas_read_back() {
     for is_full in [false, true] {
         let root = folder(is_full);
         let model = open_with_frames(root.path());
-        let reduction = reduction(&*model);
-        let shown = states(&*model.reduced(&reduction).unwrap());
+        let compressed = compressed(&*model);
+        let shown = states(&*model.compressed_frames(&compressed).unwrap());
         let result = tempfile::tempdir().unwrap();
-        model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
+        model.write(&compressed, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
         let read = open_with_frames(result.path());
         assert_near(&states(read.source()), &shown, 2e-6);
         let file = fs::read(result.path().join("point_cloud/iteration_300").join(POINT_CLOUD_FILE)).unwrap();
@@ -296,10 +296,10 @@ fn proxy_of_similar_members_is_their_mean_at_every_frame() {
         Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] },
         Cluster { output: 1, leader: 2, members: vec![(2, 0.3), (3, 0.7)] },
     ];
-    let proxies = model.solve(&clusters, ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
-    let reduction =
+    let proxies = model.compute_proxies(&clusters, ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
+    let compressed =
         CompressedModel { clusters: clusters.to_vec(), proxies, ..CompressedModel::pruned(vec![0, 2], &rule) };
-    let found = states(&*model.reduced(&reduction).unwrap());
+    let found = states(&*model.compressed_frames(&compressed).unwrap());
     for (found, all) in found.iter().zip(states(model.source())) {
         for c in 0..3 {
             let plane = all.position.plane(c);
@@ -317,7 +317,7 @@ fn proxy_of_similar_members_is_their_mean_at_every_frame() {
         let dot: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum();
         assert!(dot.abs() > 1.0 - 1e-6, "{a:?} {b:?}");
     }
-    assert!(reduction.proxies.deviation.unwrap() < 1e-5, "{:?}", reduction.proxies.deviation);
+    assert!(compressed.proxies.deviation.unwrap() < 1e-5, "{:?}", compressed.proxies.deviation);
 }
 
 #[test]
@@ -330,13 +330,18 @@ fn splatv_of_a_lite_model_keeps_motion_and_stored_words() {
     model.write(&all, OutputKind::Splatv, &path, &Limits::NONE, &Events::IGNORED).unwrap();
     let read = open_with_frames(&path);
     assert_eq!(
-        (read.kind(), read.source().info().count, read.own_output()),
+        (read.kind(), read.source().info().count, read.default_output_kind()),
         ("splaTV model", COUNT, OutputKind::Splatv)
     );
     // Colors and opacities are stored as bytes, and colors outside 0 … 1 are clamped, so they are not compared.
     for (found, expected) in states(read.source()).iter().zip(states(model.source())) {
         let pairs = |column: Attributes| {
-            found.column(column).planes().iter().zip(expected.column(column).planes()).collect::<Vec<_>>()
+            found
+                .attribute_values(column)
+                .planes()
+                .iter()
+                .zip(expected.attribute_values(column).planes())
+                .collect::<Vec<_>>()
         };
         for column in [Attributes::POSITION, Attributes::ROTATION, Attributes::LOG_SCALE] {
             pairs(column).iter().for_each(|(a, b)| assert!((*a - *b).abs() < 5e-3, "{}: {a} {b}", column.name()));
@@ -448,13 +453,13 @@ fn archives_restore_folders_and_splatv_files() {
     for is_full in [false, true] {
         let root = folder(is_full);
         let model = open_with_frames(root.path());
-        let kind = check_round_trip(&*model, &reduction(&*model), &options, 1e-3);
+        let kind = check_round_trip(&*model, &compressed(&*model), &options, 1e-3);
         assert_eq!(kind, OutputKind::Model);
         let alone = root.path().join("alone.ply");
         fs::copy(root.path().join("point_cloud/iteration_300").join(POINT_CLOUD_FILE), &alone).unwrap();
         if !is_full {
             let alone = open_with_frames(&alone);
-            assert_eq!(check_round_trip(&*alone, &reduction(&*alone), &options, 1e-3), OutputKind::Ply);
+            assert_eq!(check_round_trip(&*alone, &compressed(&*alone), &options, 1e-3), OutputKind::Ply);
             let path = root.path().join("a.splatv");
             let all = CompressedModel::pruned((0..COUNT as u32).collect(), &Recipe::preset("default").unwrap().merge);
             model.write(&all, OutputKind::Splatv, &path, &Limits::NONE, &Events::IGNORED).unwrap();

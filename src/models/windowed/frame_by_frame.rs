@@ -78,7 +78,7 @@ impl MotionModel for FrameByFrame {
             let now = self.frame(time) as f32;
             let slopes =
                 raw.format_specific.plane(FRAME).iter().map(|&frame| f32::from(u8::from(frame == now))).collect();
-            *jacobian.column_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes);
+            *jacobian.derivative_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes);
         }
         Ok(jacobian)
     }

@@ -94,7 +94,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
             opening: whole,
             // A copy of the stored parameters and the values prepared from them.
             reader: whole + 16 + 8,
-            reduced: 2 * whole,
+            compressed: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             prepared: 0,
             file: whole + 24,
@@ -132,7 +132,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         Ok(self)
     }
 
-    fn own_output(&self) -> OutputKind {
+    fn default_output_kind(&self) -> OutputKind {
         self.own
     }
 
@@ -146,7 +146,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
     }
 
@@ -154,28 +154,28 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         self.reopener.is_none()
     }
 
-    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
         let written = (OutputKind::Ftgs, "model.ftgs.ply");
-        self.reopener()?.content(self, reduction, written, FileContent::from_name)
+        self.reopener()?.content(self, compressed, written, FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.reopener()?.frames(content, &self.model.info().times)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.compressed_frames(reduction)))
+    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.compressed_frames(compressed)))
     }
 
     fn write(
         &self,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
-        write_frames(&self.model, reduction, kind, path, limits.max_kept_frames, events)
+        write_frames(&self.model, compressed, kind, path, limits.max_kept_frames, events)
     }
 }
 

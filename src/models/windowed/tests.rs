@@ -50,8 +50,8 @@ fn states(model: &dyn InputModel) -> Vec<Gaussians> {
     frames.map(|frame| gather_all(model.source(), frame, Attributes::all()).unwrap()).collect()
 }
 
-fn write(model: &dyn InputModel, reduction: &CompressedModel, kind: OutputKind, path: &Path) -> Vec<String> {
-    model.write(reduction, kind, path, &Limits::NONE, &Events::IGNORED).unwrap()
+fn write(model: &dyn InputModel, compressed: &CompressedModel, kind: OutputKind, path: &Path) -> Vec<String> {
+    model.write(compressed, kind, path, &Limits::NONE, &Events::IGNORED).unwrap()
 }
 
 fn pruned(kept: Vec<u32>) -> CompressedModel {
@@ -67,7 +67,7 @@ fn ftgs_states_follow_the_formulas_of_the_player() {
         write_ftgs(&stored, &ClipTimes { first, last, ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
         let times = TIMES.map(|time| first + (last - first) * time);
         let model = open_at(&path, &times);
-        assert_eq!((model.kind(), model.own_output()), ("ftgs-player model", OutputKind::Ftgs));
+        assert_eq!((model.kind(), model.default_output_kind()), ("ftgs-player model", OutputKind::Ftgs));
         for (state, time) in states(&*model).iter().zip(TIMES) {
             for i in 0..COUNT {
                 let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);
@@ -107,9 +107,9 @@ fn deltas_of_refinement_are_written_into_the_rows() {
     let model = open_at(&path, &TIMES);
     let mut by = Gaussians { position: AttributeValues::zeros(3, 2), ..Gaussians::default() };
     by.position.set_row(1, [1.0, 0.0, 0.0]);
-    let reduction = CompressedModel { delta: ParamDelta(by), ..pruned(vec![2, 5]) };
-    write(&*model, &reduction, OutputKind::Ftgs, &small);
-    assert_eq!(states(&*open_at(&small, &TIMES)), states_of(&*model.reduced(&reduction).unwrap()));
+    let compressed = CompressedModel { delta: ParamDelta(by), ..pruned(vec![2, 5]) };
+    write(&*model, &compressed, OutputKind::Ftgs, &small);
+    assert_eq!(states(&*open_at(&small, &TIMES)), states_of(&*model.compressed_frames(&compressed).unwrap()));
 }
 
 fn states_of(source: &dyn FrameSource) -> Vec<Gaussians> {
@@ -129,10 +129,11 @@ fn proxies_of_copies_move_like_their_members() {
     let model = open_at(&path, &[2.0, 3.0, 4.0, 6.0]);
     let rule = Recipe::preset("default").unwrap().merge;
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] };
-    let proxies = model.solve(std::slice::from_ref(&cluster), ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
+    let proxies =
+        model.compute_proxies(std::slice::from_ref(&cluster), ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
     assert!(proxies.deviation.is_some_and(|deviation| deviation < 1e-5), "{proxies:?}");
-    let reduction = CompressedModel { clusters: vec![cluster], proxies, ..pruned(vec![0, 4]) };
-    for (merged, all) in states_of(&*model.reduced(&reduction).unwrap()).iter().zip(states(&*model)) {
+    let compressed = CompressedModel { clusters: vec![cluster], proxies, ..pruned(vec![0, 4]) };
+    for (merged, all) in states_of(&*model.compressed_frames(&compressed).unwrap()).iter().zip(states(&*model)) {
         (0..3).for_each(|c| assert!((merged.position.plane(c)[0] - all.position.plane(c)[0]).abs() < 1e-5));
     }
 }
@@ -169,7 +170,7 @@ fn tsog_states_follow_the_formulas_of_the_player() {
     write_tsog(&timed(Timeline::Windows), &path).unwrap();
     let stored = read_tsog(&path, ReadLimit::NONE).unwrap().params;
     let model = open_at(&path, &TIMES);
-    assert_eq!((model.kind(), model.own_output()), ("TSOG model", OutputKind::Tsog));
+    assert_eq!((model.kind(), model.default_output_kind()), ("TSOG model", OutputKind::Tsog));
     for (state, time) in states(&*model).iter().zip(TIMES) {
         for i in 0..COUNT {
             let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);

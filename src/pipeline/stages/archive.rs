@@ -167,7 +167,7 @@ impl ArchiveStage {
         let (archived, AsToml(summary)) = journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
             let (archived, summary) = match scene.input.archives_as_frames() {
                 true => {
-                    let left = scene.input.reduced(compressed)?;
+                    let left = scene.input.compressed_frames(compressed)?;
                     let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
                     (PreparedArchive::Frames(bounds), summary)
                 }
@@ -253,7 +253,7 @@ impl ArchiveStage {
 /// Fails if the input cannot be archived or values are not finite.
 pub fn estimated_bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
     if scene.input.archives_as_frames() {
-        return bounds::bytes(scene, &*scene.input.reduced(compressed)?);
+        return bounds::bytes(scene, &*scene.input.compressed_frames(compressed)?);
     }
     let content = scene.input.archive_content(compressed)?;
     Ok(archive::encode(&content, &Grids::from_content(&content).steps(ESTIMATE_OCTAVES))?.bytes.len() as u64)

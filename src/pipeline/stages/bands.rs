@@ -38,7 +38,7 @@ const DROPPED_DEGREES: &str = "lower SH degree";
 /// - otherwise: `degree`, and the journal gets a note that higher coefficients are dropped.
 pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
     let all = scene.source().info().sh_degree;
-    match scene.input.needs_all_bands() {
+    match scene.input.reason_to_keep_sh_degree() {
         _ if degree >= all => all,
         Some(why) => {
             journal.leave_out(DROPPED_DEGREES, why);
@@ -110,7 +110,7 @@ impl ShDegreeStage {
         let per_gaussian = vec![
             ("kept", bytes_of_survivors(output_fraction, 24)),
             ("states", whole + bytes_of_survivors(output_fraction, 2 * whole)),
-            ("result", bytes_of_survivors(output_fraction, work.input.reduced)),
+            ("result", bytes_of_survivors(output_fraction, work.input.compressed)),
             ("readers", reader + bytes_of_survivors(output_fraction, reader)),
             ("held", held + bytes_of_survivors(output_fraction, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
@@ -121,7 +121,7 @@ impl ShDegreeStage {
             seconds: work.reading_seconds(work.gaussian_count(), 2.0 * views as f64)
                 + work.render_seconds(views as f64, work.gaussian_count(), RENDER_COST)
                 + work.render_seconds(2.0 * views as f64, output_fraction * work.gaussian_count(), RENDER_COST),
-            reads: 2.0 * work.scattered_full_reads(views, limits),
+            reads: 2.0 * work.scattered_whole_input_reads(views, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.block_buffer_memory(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
         }
@@ -140,7 +140,7 @@ impl ShDegreeStage {
     ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
         let views = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
-        let stay = match scene.input.needs_all_bands() {
+        let stay = match scene.input.reason_to_keep_sh_degree() {
             _ if all == 0 => Some("colors have SH degree 0"),
             None if compressed.is_empty() || views.is_empty() => Some("there are no Gaussians or no views to compare"),
             why => why,
@@ -149,7 +149,7 @@ impl ShDegreeStage {
             journal.leave_out(DROPPED_DEGREES, why);
             return Ok(compressed);
         }
-        let source = scene.input.reduced(&compressed)?;
+        let source = scene.input.compressed_frames(&compressed)?;
         let (mut found, mut tried, mut sh_degree) = ([0.0; 2], Vec::new(), all);
         // A lower degree is tried only if the last one was accepted.
         while sh_degree > 0 && tried.len() == all - sh_degree {

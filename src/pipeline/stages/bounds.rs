@@ -25,7 +25,7 @@ use crate::pipeline::stages::reference_views::{
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::scene::{Scene, first_frame_box};
-use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 
 /// Compression level of zstd for archives of frames.
 const LEVEL: i32 = 15;
@@ -49,7 +49,7 @@ pub(crate) fn packing(bounds: ErrorBounds) -> Packing {
 /// Returns the memory that writing an archive of frames takes, as named parts in bytes. Empty for models and point
 /// clouds, whose archives store no frames.
 pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
-    if work.input.reduced > 0 || work.frames == 1 {
+    if work.input.compressed > 0 || work.frames == 1 {
         return Vec::new();
     }
     [
@@ -210,7 +210,7 @@ impl FrameSource for Rounded<'_> {
         Ok(Box::new(RoundedReader { reader: self.source.open(ids)?, bounds: self.bounds }))
     }
 
-    fn reads(&self) -> Reads {
+    fn reads(&self) -> ReadCounts {
         self.source.reads()
     }
 }
@@ -226,7 +226,7 @@ impl BlockReader for RoundedReader<'_> {
         for column in want.iter() {
             let step = 2.0 * self.bounds.max_error(column);
             if step > 0.0 {
-                let values = out.column_mut(column).planes_mut().iter_mut();
+                let values = out.attribute_values_mut(column).planes_mut().iter_mut();
                 values.for_each(|value| *value = ((f64::from(*value) / step).round() * step) as f32);
             }
         }

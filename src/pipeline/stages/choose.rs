@@ -77,13 +77,13 @@ impl Choose {
     pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         // The trajectories of proxies, which replace merged clusters, are computed from all members.
-        let merging = if work.input.reduced > 0 { output_fraction } else { 1.0 };
+        let merging = if work.input.compressed > 0 { output_fraction } else { 1.0 };
         let (reader, held) = (work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let per_gaussian = vec![
             ("alternatives", bytes_of_survivors(output_fraction, 8)),
             ("clusters", BYTES_PER_GAUSSIAN),
             ("states", whole + bytes_of_survivors(output_fraction, whole)),
-            ("result", bytes_of_survivors(output_fraction, work.input.reduced)),
+            ("result", bytes_of_survivors(output_fraction, work.input.compressed)),
             ("readers", reader + bytes_of_survivors(merging, reader)),
             ("held", held + bytes_of_survivors(merging, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
@@ -97,7 +97,7 @@ impl Choose {
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64) + made,
-            reads: work.full_reads(frames, limits) + work.scattered_full_reads(frames, limits),
+            reads: work.whole_input_reads(frames, limits) + work.scattered_whole_input_reads(frames, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.block_buffer_memory(), ("views", view_bytes)],
         }
@@ -151,7 +151,7 @@ impl Choose {
 /// Returns two mean PSNRs against the original over `views`, dB. First: of the model that consists of the unchanged
 /// Gaussians `pruned` (increasing ids). Second: of the model `merged`.
 fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, views: &[FrameView]) -> Result<[f64; 2]> {
-    let result = scene.input.reduced(merged)?;
+    let result = scene.input.compressed_frames(merged)?;
     let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut sums = [0.0; 2];
     let views_together = VIEWS_PER_BATCH.min(scene.limits.views_together);

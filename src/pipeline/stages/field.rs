@@ -81,7 +81,7 @@ impl FieldPrecisionStage {
         let per_gaussian = vec![
             ("kept", bytes_of_survivors(output_fraction, 24)),
             ("states", whole + bytes_of_survivors(output_fraction, whole)),
-            ("result", bytes_of_survivors(output_fraction, 2 * work.input.reduced)),
+            ("result", bytes_of_survivors(output_fraction, 2 * work.input.compressed)),
             ("readers", work.input.reader + bytes_of_survivors(output_fraction, work.input.reader)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
@@ -91,7 +91,7 @@ impl FieldPrecisionStage {
             seconds: work.reading_seconds(work.gaussian_count(), 4.0 * views as f64)
                 + work.render_seconds(2.0 * views as f64, work.gaussian_count(), RENDER_COST)
                 + work.render_seconds(2.0 * views as f64, output_fraction * work.gaussian_count(), RENDER_COST),
-            reads: work.full_reads(views, limits),
+            reads: work.whole_input_reads(views, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![
                 work.block_buffer_memory(),
@@ -118,7 +118,7 @@ impl FieldPrecisionStage {
             return Ok(compressed);
         }
         let halved = CompressedModel { field: FieldPrecision::Half, ..compressed.clone() };
-        let [exact, half] = [&compressed, &halved].map(|model| scene.input.reduced(model));
+        let [exact, half] = [&compressed, &halved].map(|model| scene.input.compressed_frames(model));
         let (exact, half) = (exact?, half?);
         let rounding = closeness(scene, [&*exact, &*half], &views)?;
         let result = match rounding >= MAX_USEFUL_PSNR {

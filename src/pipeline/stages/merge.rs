@@ -167,10 +167,11 @@ impl MergeStage {
         // States are read once. Every pass of every trial follows its pairs over all frames twice, because coinciding
         // pairs, if there are any, are merged first.
         let trials = if self.target.is_some() && self.prunes { USUAL_TRIALS } else { 1.0 };
-        let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_full_reads(work.frames, limits);
+        let followed =
+            2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_whole_input_reads(work.frames, limits);
         ResourceEstimate {
             stage: NAME,
-            reads: work.scattered_full_reads(1, limits) + followed,
+            reads: work.scattered_whole_input_reads(1, limits) + followed,
             seconds: SECONDS_TO_MERGE * work.gaussian_count()
                 + FOLLOWED_FRACTION * work.reading_seconds(work.gaussian_count(), work.frames as f64),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
@@ -216,7 +217,7 @@ impl MergeStage {
                 drop(trial);
                 scene.work.end_shard_run_before(NAME)?;
                 let MergeOutcome { compressed, summary } = &mut merged;
-                let proxies = scene.input.solve(&compressed.clusters, scored.reference, &self.recipe)?;
+                let proxies = scene.input.compute_proxies(&compressed.clusters, scored.reference, &self.recipe)?;
                 compressed.set_proxies(proxies);
                 if let Some(summary) = summary {
                     summary.deviation = compressed.proxies.deviation;
@@ -303,7 +304,7 @@ impl<'a> Trial<'a> {
     ) -> Result<Self> {
         let source = scene.source();
         let (states, finite) = states_of(source, &pool, scored.reference.frame)?;
-        let class = |(&id, is_finite): (&u32, bool)| is_finite.then(|| scene.input.class(id));
+        let class = |(&id, is_finite): (&u32, bool)| is_finite.then(|| scene.input.merge_class(id));
         let mut classes: Vec<Option<u8>> = pool.iter().zip(finite).map(class).collect();
         for id in &scored.protected {
             if let Ok(row) = pool.binary_search(id) {

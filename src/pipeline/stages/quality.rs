@@ -112,12 +112,12 @@ impl QualityStage {
         let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
         let result = vec![
             ("kept", bytes_of_survivors(output_fraction, 24)),
-            ("result", bytes_of_survivors(output_fraction, 2 * work.input.reduced)),
+            ("result", bytes_of_survivors(output_fraction, 2 * work.input.compressed)),
         ];
         ResourceEstimate {
             // The number of views is derived from the estimated time of all other stages; see `view_count`.
             seconds: 0.0,
-            reads: if self.merges { MERGED_READS } else { READS } * work.full_reads(views, limits),
+            reads: if self.merges { MERGED_READS } else { READS } * work.whole_input_reads(views, limits),
             per_gaussian: [scored_memory(limits), of_views.per_gaussian, result].concat(),
             fixed: [of_views.fixed, vec![("field", work.input.fixed), ("margin", MARGIN)]].concat(),
             ..of_views
@@ -146,7 +146,7 @@ impl QualityStage {
         let (opened, reduced);
         let result: &dyn FrameSource = match &run.archived {
             None => {
-                reduced = scene.input.reduced(&run.result)?;
+                reduced = scene.input.compressed_frames(&run.result)?;
                 &*reduced
             }
             Some(PreparedArchive::Content(encoded)) => {

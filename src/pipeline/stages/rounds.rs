@@ -130,7 +130,7 @@ impl Rounds {
         // The first round renders the views of all groups one group after the other, every later round one group.
         let frames = all.min(work.frames).div_ceil(groups);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
-        let reads = (groups as f64 + later) * work.scattered_full_reads(frames, limits);
+        let reads = (groups as f64 + later) * work.scattered_whole_input_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 

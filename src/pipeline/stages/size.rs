@@ -130,7 +130,7 @@ impl ByteLimit {
     ) -> Result<Vec<ByteLimitFit>> {
         let info = scene.source().info();
         let highest = template.sh_degree.min(info.sh_degree);
-        let lowest = if drops && scene.input.needs_all_bands().is_none() { 0 } else { highest };
+        let lowest = if drops && scene.input.reason_to_keep_sh_degree().is_none() { 0 } else { highest };
         let mut fits: Vec<ByteLimitFit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
             if fits.last().is_some_and(|fit| fit.gaussians == ids.len()) {
@@ -250,7 +250,7 @@ impl ByteLimit {
     /// Chooses the `count` Gaussians of `compressed` that stay: those that must stay, then those with the highest
     /// removal errors (squared error of renders caused by removing one). Returns their indices in `compressed`.
     fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
-        let result = scene.input.reduced(compressed)?;
+        let result = scene.input.compressed_frames(compressed)?;
         let places: Vec<u32> = (0..compressed.len() as u32).collect();
         let views = select_evenly(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
         let looked_at = (&scene.schedule.cameras[..], &views[..]);

@@ -25,6 +25,7 @@ use crate::outputs::container::{FRAME_BLOCK, write_container};
 use crate::outputs::index_map::write_index_map;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
+use crate::pipeline::CompressedScene;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::summary::{self, CameraSummary, Summary};
@@ -107,7 +108,7 @@ impl Stage for WriteStage {
             reorder(&mut map, &encoded.order);
         }
         if self.kind == OutputKind::Sog {
-            let written = run.scene.input.reduced(&run.result)?;
+            let written = run.scene.input.compressed_frames(&run.result)?;
             reorder(&mut map, &morton_order(&gather_all(&*written, 0, Attributes::POSITION)?.position));
         }
         let journal = std::mem::take(&mut run.journal);
@@ -146,7 +147,7 @@ impl Stage for WriteStage {
         // The summary file may be published, so it has only file names. The caller gets the paths as given by the user.
         summary.input.path = run.scene.path.to_string_lossy().into_owned();
         summary.output = self.output.to_string_lossy().into_owned();
-        run.written = Some((summary, map));
+        run.written = Some(CompressedScene { summary, index_map: map });
         Ok(())
     }
 }
@@ -194,10 +195,10 @@ impl WriteStage {
     /// number of Gaussians in the result divided by that in the input.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
-        let is_solved = work.input.reduced > 0;
+        let is_solved = work.input.compressed > 0;
         let mut per_gaussian = [
             scored_memory(limits),
-            vec![("kept", 40), ("result", bytes_of_survivors(output_fraction, work.input.reduced))],
+            vec![("kept", 40), ("result", bytes_of_survivors(output_fraction, work.input.compressed))],
         ]
         .concat();
         let within = if self.kind == OutputKind::Archive { bounds::storing_memory(work) } else { Vec::new() };
@@ -239,7 +240,7 @@ impl WriteStage {
         };
         let reads = match is_solved && !self.kind.stores_frames() {
             true => 0.0,
-            false => parts as f64 * work.scattered_full_reads(work.frames, limits),
+            false => parts as f64 * work.scattered_whole_input_reads(work.frames, limits),
         };
         let frames = if is_solved && !self.kind.stores_frames() { 0.0 } else { work.frames as f64 };
         let left = USUAL_LEFT * work.gaussian_count();
@@ -297,7 +298,7 @@ impl WriteStage {
                         encoded.parts.into()
                     }
                     Some(PreparedArchive::Frames(bounds)) => {
-                        write_within(&*scene.input.reduced(compressed)?, *bounds, path, &scene.events)?;
+                        write_within(&*scene.input.compressed_frames(compressed)?, *bounds, path, &scene.events)?;
                         ModelSize::from_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {

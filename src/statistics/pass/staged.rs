@@ -207,7 +207,7 @@ mod tests {
             Ok(Box::new(SlowReader { reader: self.scene.open(ids)?, fails_from: self.fails_from }))
         }
 
-        fn ahead(&self) -> Option<&dyn Prefetch> {
+        fn prefetcher(&self) -> Option<&dyn Prefetch> {
             self.frame_block.is_some().then_some(self)
         }
     }

@@ -69,7 +69,7 @@ impl Renderer {
     ) -> f64 {
         assert_eq!(out.len(), gaussians.len(), "expected as many gradients as Gaussians");
         assert!(
-            out.column(Attributes::SH).width() <= gaussians.sh.width(),
+            out.derivatives(Attributes::SH).width() <= gaussians.sh.width(),
             "expected gradients of at most the SH degree of the Gaussians"
         );
         let view = CameraTerms::new(view.into());
@@ -82,7 +82,7 @@ impl Renderer {
             "expected a derivative of the size of the render"
         );
 
-        if Attributes::SH.contains(out.columns()) {
+        if Attributes::SH.contains(out.attributes()) {
             self.backward_pass::<false>(&view, &image, &pixel_gradient);
         } else {
             self.backward_pass::<true>(&view, &image, &pixel_gradient);

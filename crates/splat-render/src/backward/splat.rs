@@ -13,7 +13,7 @@ use super::super::color;
 use super::super::convention::BLOCK;
 use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat, cross, dot, opacity};
 use super::sums::SplatSums;
-use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficients};
+use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficient_count};
 
 /// Computes the gradients of the Gaussians whose projections are `splats`, and adds them to `out`, which must contain
 /// these Gaussians. `sums` holds the gradient sums of each splat.
@@ -84,7 +84,7 @@ fn add_blocks(
         }
         block.fill(&splats[..count], &sums[..count], start);
         (splats, sums) = (&splats[count..], &sums[count..]);
-        let columns = out.columns();
+        let columns = out.attributes();
         let needs_direction = columns.contains(Attributes::POSITION) && color::coefficients(gaussians) > 1;
         if needs_direction || columns.contains(Attributes::SH) {
             let directions = Directions::new(gaussians, ids.clone(), view);
@@ -174,7 +174,7 @@ impl GradientBlock {
         out: &mut GradientSpan<'_>,
     ) {
         let n = ids.len().min(BLOCK);
-        let mut values = [[0.0f32; BLOCK]; sh_coefficients(3)];
+        let mut values = [[0.0f32; BLOCK]; sh_coefficient_count(3)];
         for i in 0..n {
             for (values, value) in values.iter_mut().zip(color::basis(directions.at(i))) {
                 values[i] = value;
@@ -200,7 +200,7 @@ impl GradientBlock {
     ) {
         let n = ids.len().min(BLOCK);
         // ∂L/∂Y_k for each SH basis function Y_k: the sum over color channels of the SH coefficient times ∂L/∂color.
-        let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
+        let mut by_value = [[0.0f32; BLOCK]; sh_coefficient_count(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(color::coefficients(gaussians)).skip(1) {
             let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
             for i in 0..n {
@@ -233,7 +233,7 @@ impl GradientBlock {
     #[inline(always)]
     fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
-        let plane = |column: Attributes, c: usize| &gaussians.column(column).plane(c)[ids.clone()][..n];
+        let plane = |column: Attributes, c: usize| &gaussians.attribute_values(column).plane(c)[ids.clone()][..n];
         let position: [&[f32]; 3] = std::array::from_fn(|c| plane(Attributes::POSITION, c));
         let rotation: [&[f32]; 4] = std::array::from_fn(|c| plane(Attributes::ROTATION, c));
         let log_scale: [&[f32]; 3] = std::array::from_fn(|c| plane(Attributes::LOG_SCALE, c));

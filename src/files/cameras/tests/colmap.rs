@@ -56,13 +56,13 @@ fn colmap_text_and_binary_give_the_same_rig() {
         write_colmap(folder.path(), "PINHOLE 80 60 70 71 39.5 31", binary);
         let rig = load(folder.path(), &CameraOptions::default()).unwrap();
         for file in ["sparse", "sparse/0"] {
-            assert_eq!(load(&folder.path().join(file), &CameraOptions::default()).unwrap().shots, rig.shots, "{file}");
+            assert_eq!(load(&folder.path().join(file), &CameraOptions::default()).unwrap().views, rig.views, "{file}");
         }
         rig
     });
     assert_eq!(text.cameras, binary.cameras);
-    let [times, splits] =
-        [&text, &binary].map(|rig| rig.shots.iter().map(|shot| (shot.time, shot.split)).collect::<Vec<_>>());
+    let [times, splits] = [&text, &binary]
+        .map(|rig| rig.views.iter().map(|rig_view| (rig_view.time, rig_view.split)).collect::<Vec<_>>());
     assert_eq!(times, splits);
     // The images are in natural order of their names, not in the order of the COLMAP file.
     assert_eq!(times, [(Some(0.0), Split::Train), (Some(1.0), Split::Train), (Some(0.5), Split::Test)]);
@@ -72,7 +72,7 @@ fn colmap_text_and_binary_give_the_same_rig() {
     // A quarter turn about x maps y to z.
     let turned = text.cameras[1].rotation * DVec3::Y;
     assert!((turned - DVec3::Z).length() < 1e-15, "{turned}");
-    assert!(text.shots[0].image.as_ref().unwrap().ends_with("cam1/frame_0001.png"));
+    assert!(text.views[0].image.as_ref().unwrap().ends_with("cam1/frame_0001.png"));
 }
 
 #[test]
@@ -88,12 +88,12 @@ fn colmap_folders_per_frame_share_the_first_cameras() {
         fs::create_dir(root.path().join(format!("colmap_{k}"))).unwrap();
     }
     let rig = load(&first, None);
-    assert_eq!(load(root.path(), None).shots, rig.shots);
+    assert_eq!(load(root.path(), None).views, rig.views);
     assert_eq!(rig.times(), [0.0, 1.0 / 3.0, 2.0 / 3.0]);
-    assert_eq!((rig.shots.len(), rig.cameras.len()), (9, 3));
-    let shot = &rig.shots[4];
-    assert!(shot.image.as_ref().unwrap().ends_with("colmap_4/cam1/frame_0003.png"), "{shot:?}");
-    let splits: Vec<Split> = rig.shots[3..6].iter().map(|shot| shot.split).collect();
+    assert_eq!((rig.views.len(), rig.cameras.len()), (9, 3));
+    let rig_view = &rig.views[4];
+    assert!(rig_view.image.as_ref().unwrap().ends_with("colmap_4/cam1/frame_0003.png"), "{rig_view:?}");
+    let splits: Vec<Split> = rig.views[3..6].iter().map(|rig_view| rig_view.split).collect();
     assert_eq!(splits, [Split::Test, Split::Train, Split::Test]);
     // The number of frames may be given, because a model may have been trained on fewer frames and its images may be
     // elsewhere.
@@ -107,7 +107,8 @@ fn colmap_times_come_from_a_table_or_are_absent() {
     let with = |times: TimesSource| load(folder.path(), &CameraOptions { times, ..CameraOptions::default() });
     let table = folder.path().join("t.csv");
     fs::write(&table, "name,time\ncam1/frame_0001.png,0.25\nframe_0003.png, 0.5\nframe_0002,4\n").unwrap();
-    let times: Vec<_> = with(TimesSource::Table(table.clone())).unwrap().shots.iter().map(|shot| shot.time).collect();
+    let times: Vec<_> =
+        with(TimesSource::Table(table.clone())).unwrap().views.iter().map(|rig_view| rig_view.time).collect();
     assert_eq!(times, [Some(0.25), Some(0.5), Some(4.0)]);
     assert!(with(TimesSource::None).unwrap().times().is_empty());
     for (text, parts) in [

@@ -32,7 +32,7 @@ impl TempPly {
 }
 
 fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutputRow> {
-    ids.into_iter().map(|source| OutputRow { source, proxy: None }).collect()
+    ids.into_iter().map(|template_row| OutputRow { template_row, proxy: None }).collect()
 }
 
 fn all(ply: &Ply) -> Gaussians {
@@ -46,7 +46,7 @@ fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     let mut out = Gaussians::zeros(len, sh_degree);
     for (k, column) in Attributes::all().iter().enumerate() {
         let fill = |(i, value): (usize, &mut f32)| *value = (1000 * (k + 1) + i) as f32;
-        out.column_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
+        out.attribute_values_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
     }
     out
 }
@@ -127,19 +127,24 @@ fn a_proxy_replaces_attributes_and_keeps_extra_properties() {
             let ply = temp.open(&file(format, kind, &names, 6, "\n"));
             let proxies = proxies(2, 1);
             let rows = [
-                OutputRow { source: 4, proxy: Some(1) },
-                OutputRow { source: 2, proxy: None },
-                OutputRow { source: 4, proxy: Some(0) },
+                OutputRow { template_row: 4, proxy: Some(1) },
+                OutputRow { template_row: 2, proxy: None },
+                OutputRow { template_row: 4, proxy: Some(0) },
             ];
             let written = temp.write(&ply, &rows, &proxies);
             let folder = TempPly::new();
             let out = folder.open(&written);
             let (before, after) = (all(&ply), all(&out));
             for column in Attributes::all().iter() {
-                for plane in 0..after.column(column).width() {
-                    let source = |gaussians: &Gaussians, i: usize| gaussians.column(column).plane(plane)[i];
+                for plane in 0..after.attribute_values(column).width() {
+                    let source = |gaussians: &Gaussians, i: usize| gaussians.attribute_values(column).plane(plane)[i];
                     let expected = [source(&proxies, 1), source(&before, 2), source(&proxies, 0)];
-                    assert_eq!(after.column(column).plane(plane), expected, "{format} {kind} {}", column.name());
+                    assert_eq!(
+                        after.attribute_values(column).plane(plane),
+                        expected,
+                        "{format} {kind} {}",
+                        column.name()
+                    );
                 }
             }
             for property in ply.properties().iter().filter(|property| foreign.contains(&property.name.as_str())) {
@@ -156,11 +161,11 @@ fn deltas_are_added_and_zeros_leave_the_bytes() {
     for (format, kind) in [("binary_little_endian", "float"), ("binary_big_endian", "double"), ("ascii", "short")] {
         let ply = temp.open(&file(format, kind, &names(), 3, "\n"));
         let proxies = proxies(1, 1);
-        let rows = [OutputRow { source: 2, proxy: None }, OutputRow { source: 0, proxy: Some(0) }];
+        let rows = [OutputRow { template_row: 2, proxy: None }, OutputRow { template_row: 0, proxy: Some(0) }];
         let plain = temp.write(&ply, &rows, &proxies);
         let mut by = Gaussians::zeros(2, 0);
         for column in Attributes::all().difference(Attributes::LOG_SCALE).iter() {
-            by.column_mut(column).plane_mut(0).copy_from_slice(&[3.0, -2.0]);
+            by.attribute_values_mut(column).plane_mut(0).copy_from_slice(&[3.0, -2.0]);
         }
         let written = temp.write_changed(&ply, &rows, &proxies, &ParamDelta(by.clone()));
         let (folder, other) = (TempPly::new(), TempPly::new());
@@ -189,7 +194,7 @@ fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
     }
     // Proxies and deltas contain all SH coefficients, and extra properties keep their place.
     let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
-    let (rows, change) = ([OutputRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
+    let (rows, change) = ([OutputRow { template_row: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
     let mut expected = all(&temp.open(&temp.write_changed(&ply, &rows, &proxies(1, 1), &change)));
     let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
     write_like_template(&ply, &rows, &proxies(1, 1), &change, 0, &temp.path("out.ply")).unwrap();
@@ -211,7 +216,7 @@ fn a_surfel_file_drops_the_third_scale_of_proxies() {
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
     let ply = temp.open(&file("binary_little_endian", "float", &names, 1, "\n"));
     let proxies = proxies(1, 1);
-    let written = temp.write(&ply, &[OutputRow { source: 0, proxy: Some(0) }], &proxies);
+    let written = temp.write(&ply, &[OutputRow { template_row: 0, proxy: Some(0) }], &proxies);
     let out = TempPly::new();
     let out = all(&out.open(&written));
     assert_eq!(out.log_scale.row::<2>(0), proxies.log_scale.row::<2>(0));
@@ -228,8 +233,8 @@ fn missing_rows_and_proxies_are_refused() {
             .to_string()
     };
     assert!(refusal(&kept([2]), &Gaussians::default()).contains("Gaussian 2 "));
-    assert!(refusal(&[OutputRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
-    assert!(refusal(&[OutputRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
+    assert!(refusal(&[OutputRow { template_row: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
+    assert!(refusal(&[OutputRow { template_row: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
     let short = ParamDelta(Gaussians::zeros(1, 1));
     let path = temp.path("none.ply");
     let message = write_like_template(&ply, &kept([0, 1]), &Gaussians::default(), &short, NO_SH_LIMIT, &path);
@@ -249,7 +254,12 @@ fn the_inria_layout_round_trips_at_every_degree() {
         assert_eq!(ply.comments(), ["SplatRenderMode: mip", "two lines"]);
         let back = all(&ply);
         for column in Attributes::all().iter() {
-            assert_eq!(bits(back.column(column)), bits(gaussians.column(column)), "{degree} {}", column.name());
+            assert_eq!(
+                bits(back.attribute_values(column)),
+                bits(gaussians.attribute_values(column)),
+                "{degree} {}",
+                column.name()
+            );
         }
         if degree == 3 {
             assert_eq!(ply.row(0).len(), 248);

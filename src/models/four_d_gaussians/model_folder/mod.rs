@@ -14,7 +14,9 @@ use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
-use crate::source::{BlockReader, Deformation, DeformedGaussians, FrameSource, Ids, ReadPlan, Reads, SharedCounter};
+use crate::source::{
+    BlockReader, Deformation, DeformedGaussians, FrameSource, Ids, ReadCounts, ReadPlan, SharedCounter,
+};
 use rayon::prelude::*;
 
 use super::cfg_args::ModelConfig;
@@ -249,7 +251,7 @@ impl FrameSource for ModelFolder {
         }
         let mut raw = Gaussians::zeros(ids.len(), self.info.sh_degree);
         for column in Attributes::all().iter() {
-            let (from, to) = (self.canonical().column(column), raw.column_mut(column));
+            let (from, to) = (self.canonical().attribute_values(column), raw.attribute_values_mut(column));
             for c in 0..from.width() {
                 let plane = from.plane(c);
                 to.plane_mut(c).iter_mut().zip(ids.iter()).for_each(|(to, id)| *to = plane[id]);
@@ -274,8 +276,8 @@ impl FrameSource for ModelFolder {
         Some(self)
     }
 
-    fn reads(&self) -> Reads {
-        Reads { states: self.states.get(), ..Reads::default() }
+    fn reads(&self) -> ReadCounts {
+        ReadCounts { states: self.states.get(), ..ReadCounts::default() }
     }
 }
 
@@ -316,7 +318,7 @@ impl PreparedModel<'_> {
     /// Copies the attributes `want` of the stored parameters of the Gaussians `ids` to `raw`.
     fn copy_stored(&self, ids: &[u32], want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
-            *raw.column_mut(column) = self.stored.gaussians.column(column).pick(ids);
+            *raw.attribute_values_mut(column) = self.stored.gaussians.attribute_values(column).pick(ids);
         }
     }
 }

@@ -155,9 +155,10 @@ fn any_list_of_gaussians_reads_the_bits_of_the_whole() {
     let list: Vec<u32> = (0..n as u32).rev().step_by(37).collect();
     let part = std::thread::scope(|scope| scope.spawn(|| read(Ids::List(&list), 1)).join().unwrap());
     for column in Attributes::all().iter() {
-        for c in 0..whole.column(column).width() {
+        for c in 0..whole.attribute_values(column).width() {
             for (at, &id) in list.iter().enumerate() {
-                let (got, expected) = (part.column(column).plane(c)[at], whole.column(column).plane(c)[id as usize]);
+                let (got, expected) =
+                    (part.attribute_values(column).plane(c)[at], whole.attribute_values(column).plane(c)[id as usize]);
                 assert_eq!(got.to_bits(), expected.to_bits(), "{} of Gaussian {id}: {got}, {expected}", column.name());
             }
         }
@@ -269,7 +270,7 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
     let mut by_state = Gradients::new(n, Attributes::all(), 3);
     for column in Attributes::all().iter() {
         // Low-discrepancy values serve as noise.
-        let sums = by_state.column_mut(column).planes_mut().iter_mut().enumerate();
+        let sums = by_state.derivatives_mut(column).planes_mut().iter_mut().enumerate();
         sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
     }
     let mut by_raw = by_state.clone();
@@ -281,10 +282,10 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
         assert!(again == jacobian, "{threads} threads");
     }
     for column in Attributes::all().difference(Attributes::POSITION).iter() {
-        assert!(by_raw.column(column) == by_state.column(column), "{} follows the field", column.name());
+        assert!(by_raw.derivatives(column) == by_state.derivatives(column), "{} follows the field", column.name());
     }
 
-    let weights = by_state.column(Attributes::POSITION);
+    let weights = by_state.derivatives(Attributes::POSITION);
     let (mut off, mut through_field) = (0, 0);
     for axis in 0..3 {
         let placed = |step: f32| {
@@ -303,7 +304,7 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
             let apart = f64::from(high.plane(axis)[i]) - f64::from(low.plane(axis)[i]);
             let change = |c: usize| f64::from(at_high.plane(c)[i]) - f64::from(at_low.plane(c)[i]);
             let expected = (0..3).map(|c| f64::from(weights.plane(c)[i]) * change(c)).sum::<f64>() / apart;
-            let got = f64::from(by_raw.column(Attributes::POSITION).plane(axis)[i]);
+            let got = f64::from(by_raw.derivatives(Attributes::POSITION).plane(axis)[i]);
             // States are f32: an error of about 1e-7 over 4e-4, times three.
             off += usize::from((got - expected).abs() > 3e-3 * (1.0 + expected.abs()));
             through_field += usize::from((got - f64::from(weights.plane(axis)[i])).abs() > 1e-2);

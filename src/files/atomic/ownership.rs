@@ -25,7 +25,7 @@ const MAX_SUMMARY: u64 = 16 << 20;
 
 /// Files that belong to a result, according to the summary of the result.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Owner {
+pub(super) enum ListedFiles {
     /// There is no summary with a list of files, or another program wrote the summary.
     Unknown,
     /// This program wrote the summary, which lists these files of the result by their paths relative to the summary.
@@ -40,27 +40,28 @@ struct Declared {
     files: BTreeSet<String>,
 }
 
-impl Owner {
+impl ListedFiles {
     /// Reads the summary at `path`, which may be a link, and returns the list of the files that belong to the result.
-    /// Returns [`Owner::Unknown`] if the file cannot be read or is not a summary of this program with a list of files.
-    pub(super) fn read(path: &Path) -> Owner {
+    /// Returns [`ListedFiles::Unknown`] if the file cannot be read or is not a summary of this program with a list of
+    /// files.
+    pub(super) fn read(path: &Path) -> ListedFiles {
         // Open without waiting: a plain open of a FIFO would wait until another program opens it for writing.
-        open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
+        open_without_waiting(path).map_or(ListedFiles::Unknown, ListedFiles::read_file)
     }
 
     /// Reads the open summary `file` and returns the list of the files that belong to the result. Returns
-    /// [`Owner::Unknown`] if `file` cannot be read or is not a summary of this program with a list of files.
-    pub(super) fn read_file(mut file: File) -> Owner {
+    /// [`ListedFiles::Unknown`] if `file` cannot be read or is not a summary of this program with a list of files.
+    pub(super) fn read_file(mut file: File) -> ListedFiles {
         if !file.metadata().is_ok_and(|found| found.is_file() && found.len() <= MAX_SUMMARY) {
-            return Owner::Unknown;
+            return ListedFiles::Unknown;
         }
         let mut text = Vec::new();
         if (&mut file).take(MAX_SUMMARY).read_to_end(&mut text).is_err() || !text.trim_ascii_start().starts_with(b"{") {
-            return Owner::Unknown;
+            return ListedFiles::Unknown;
         }
         match serde_json::from_slice::<Declared>(&text) {
-            Ok(Declared { tool, files }) if tool.starts_with("splatsieve") => Owner::Listed(files),
-            _ => Owner::Unknown,
+            Ok(Declared { tool, files }) if tool.starts_with("splatsieve") => ListedFiles::Listed(files),
+            _ => ListedFiles::Unknown,
         }
     }
 }
@@ -108,8 +109,8 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
 /// Entries that cannot be moved stay in `old`, and the first failure is returned. The function may be called again
 /// after an interruption at any point: every entry is always in exactly one of the two folders.
 pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result<()> {
-    let listed = match old.open_file(SUMMARY_FILE, false).map(Owner::read_file) {
-        Ok(Owner::Listed(listed)) => listed,
+    let listed = match old.open_file(SUMMARY_FILE, false).map(ListedFiles::read_file) {
+        Ok(ListedFiles::Listed(listed)) => listed,
         _ => BTreeSet::new(),
     };
     let mut foreign = Vec::new();
