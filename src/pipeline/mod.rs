@@ -24,6 +24,7 @@ pub use open::open_to_measure;
 pub use plan::RunPlan;
 pub use record::{FitTarget, RecipeRecord, RunOptions};
 pub use request::{Goal, PruneOrMerge, Quality, Request, Target};
+pub use stage::CompressedScene;
 
 use crate::cache::Completion;
 use crate::compressed_model::CompressedModel;
@@ -82,16 +83,6 @@ fn compress_whole(request: &Request) -> Result<Summary> {
     };
     let (scene, plan, arrived) = open_to_measure(&request.input, plan, &mut journal)?;
     Ok(run_stages(&scene, &plan, arrived, request, journal)?.summary)
-}
-
-/// Result of [`compress_scene`], besides the files that it wrote.
-#[derive(Debug)]
-pub struct CompressedScene {
-    /// Summary of the run.
-    pub summary: Summary,
-    /// Index in the output of every input Gaussian; `None` if the Gaussian was removed. Merged Gaussians have the index
-    /// of their proxy.
-    pub index_map: Vec<Option<u32>>,
 }
 
 /// Compresses the open scene `scene` as `request` asks and writes the result, like [`compress`].

@@ -8,9 +8,8 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::CompressedScene;
 use super::request::Request;
-use super::summary::{ArchiveSummary, GoalSummary, InputSummary, MergeSummary};
+use super::summary::{ArchiveSummary, GoalSummary, InputSummary, MergeSummary, Summary};
 use crate::archive::EncodedArchive;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -134,6 +133,16 @@ impl Measured {
     pub fn measured_statistics(&self) -> MeasuredOnArrival {
         MeasuredOnArrival { scanned: true, visible_contribution: self.visible_contribution.is_some() }
     }
+}
+
+/// Result of [`compress_scene`](super::compress_scene), besides the files that it wrote.
+#[derive(Debug)]
+pub struct CompressedScene {
+    /// Summary of the run.
+    pub summary: Summary,
+    /// Index in the output of every input Gaussian; `None` if the Gaussian was removed. Merged Gaussians have the index
+    /// of their proxy.
+    pub index_map: Vec<Option<u32>>,
 }
 
 /// Plan of how many Gaussians ranking and refinement leave. Ranking removes some of the Gaussians. Refinement then
