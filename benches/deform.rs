@@ -85,8 +85,8 @@ fn deform(criterion: &mut Criterion) {
             });
         });
     }
-    // Derivatives of positions at a frame with respect to the stored positions: one forward pass through the position
-    // head, and one backward pass for each component.
+    // Derivatives of the positions at a frame with respect to the stored positions. They take one forward pass through
+    // the position head, and one backward pass for each of the three coordinates.
     let mut raw = Gaussians::zeros(BLOCK, 3);
     raw.position = position;
     for (name, field) in

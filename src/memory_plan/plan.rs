@@ -153,9 +153,9 @@ impl MemoryPlan {
         PROGRAM_BYTES + PER_THREAD * self.work.threads + self.work.known_bytes() + held
     }
 
-    /// Returns the number of bytes by which memory exceeds the budget: the excess of each stage, summed over all
-    /// stages, plus the excess of [`MemoryPlan::base_bytes`], the memory that is taken throughout the run. Returns 0 if
-    /// all stages fit.
+    /// Returns a number of bytes that is 0 if all stages fit into the budget, and that shrinks as the plan gets closer
+    /// to the budget: the bytes by which each stage exceeds it, summed over all stages, plus the bytes by which
+    /// [`MemoryPlan::base_bytes`] (memory that is taken throughout the run) exceeds it.
     fn excess_bytes(&self) -> u64 {
         let available = self.budget.saturating_sub(self.base_bytes());
         let beyond = self.estimates.iter().map(|estimate| estimate.bytes(&self.work).saturating_sub(available));

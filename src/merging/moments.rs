@@ -43,8 +43,9 @@ pub struct Ellipsoid {
 /// Returns the Gaussian that has the mean Σ w_i μ_i and the covariance of the mixture `parts`. If `about` is given, the
 /// mean is that point instead, and the second moments are taken about it.
 ///
-/// Canonical form: the scales descend. The component of largest magnitude is positive in each of the first two axes.
-/// The third axis makes the frame right-handed, so a reflection is resolved by flipping the axis of the smallest scale.
+/// Canonical form: the scales are in descending order. In each of the first two axes, the component of largest
+/// magnitude is positive. The sign of the third axis, that of the smallest scale, is the one that makes the axes
+/// right-handed.
 ///
 /// Accuracy: at any anisotropy, every scale has a relative error of about 1e-14, if the scaled axes of `parts` have
 /// errors of this size. Edge cases: without parts all scales are zero, and the mean is `about` or the origin. Scales

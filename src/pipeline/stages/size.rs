@@ -265,8 +265,8 @@ impl ByteLimit {
 /// must stay, less than `count`. `tried`: number of sizes tried before.
 ///
 /// The result is at least `protected` and less than `count`. Once [`MAX_TRIED`] sizes have been tried, it is at most
-/// half of `count` (or `protected`). So the search ends after at most 32 more sizes, no matter how the bytes depend on
-/// the number of Gaussians.
+/// the larger of `count` / 2 and `protected`. So the search ends after at most 32 more sizes, no matter how the bytes
+/// depend on the number of Gaussians.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
     let most = if tried < MAX_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)
