@@ -32,7 +32,10 @@ impl Forecast {
         searches: bool,
         memory_bytes: u64,
     ) -> Forecast {
-        let likely = core_seconds(needs);
+        // If stages may turn out to be unnecessary, their time is either spent or not. The geometric mean of both sums
+        // has the smallest ratio to either.
+        let all_stages = core_seconds(needs);
+        let likely = (least * all_stages).sqrt();
         let measured = work.throughput.processors;
         let error_range = match (searches, measured) {
             (true, _) => ERROR_RANGE_SEARCH,
@@ -40,7 +43,7 @@ impl Forecast {
             (_, None) => ERROR_RANGE_UNCALIBRATED,
         };
         let core =
-            EstimateRange { least: error_range[0] * least, likely, most: error_range[1] * likely + FIXED_SECONDS };
+            EstimateRange { least: error_range[0] * least, likely, most: error_range[1] * all_stages + FIXED_SECONDS };
         let threads = work.threads as f64;
         let processors = measured.unwrap_or(threads).min(threads);
         let usual = (0.9 * processors).max(1f64.min(processors));
