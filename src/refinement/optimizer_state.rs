@@ -450,7 +450,12 @@ impl<'a> OptimizerState<'a> {
             let image = renderer.render(&now.state, view, self.scene.background);
             Ok(self.step_params.loss.errors(&image, &values))
         };
-        let losses: Vec<[f64; 2]> = views.par_iter().map_init(|| self.new_worker(), errors).collect::<Result<_>>()?;
+        // A part of the views has one worker at a time. With fewer workers than threads, there are at most
+        // `views_together` parts.
+        let workers = self.scene.limits.views_together.max(1);
+        let views_per_part = if workers < rayon::current_num_threads() { views.len().div_ceil(workers) } else { 1 };
+        let parts = views.par_iter().with_min_len(views_per_part);
+        let losses: Vec<[f64; 2]> = parts.map_init(|| self.new_worker(), errors).collect::<Result<_>>()?;
         Ok(RenderQuality::from_errors(&losses))
     }
 
