@@ -132,9 +132,9 @@ pub(super) struct Compress {
     pub(super) output: PathBuf,
     #[command(flatten)]
     pub(super) format: OutputFormat,
-    /// PSNR of an archive (NAME.gsz) against the same result without quantization, such as 45dB [default: 9 dB above
-    /// the PSNR of the result against the original, at most 50dB; quantization then lowers the PSNR against the
-    /// original by about 0.5 dB]
+    /// PSNR of renders of an archive (NAME.gsz) against renders of the same result without quantization, such as 45dB
+    /// [default: 9 dB above the PSNR of the result against the original, at most 50 dB; quantization then lowers the
+    /// PSNR against the original by about 0.5 dB]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
@@ -178,7 +178,7 @@ pub(super) struct Compress {
 #[derive(Debug, Args)]
 #[command(group(clap::ArgGroup::new("size_of_output")))]
 pub(super) struct OutputSize {
-    /// Fraction of the Gaussians to keep, exactly: 0.1, 10% or 10x (a tenth)
+    /// Fraction of the Gaussians to keep, exactly: 0.1, 10% or 10x (all three mean a tenth)
     #[arg(long, help_heading = HOW_SMALL, value_name = "FRACTION", group = "size_of_output", value_parser = parse_ratio)]
     pub(super) ratio: Option<f64>,
     /// Number of Gaussians to keep, exactly
@@ -189,7 +189,7 @@ pub(super) struct OutputSize {
     /// The files beside the output (summary, recipe, index map) count too, except beside an archive.
     #[arg(long, help_heading = HOW_SMALL, value_name = "BYTES", group = "size_of_output", value_parser = parse_bytes)]
     pub(super) size: Option<u64>,
-    /// Smallest output whose renders have at least this mean PSNR against the original's, such as 35dB
+    /// Smallest output whose renders have at least this mean PSNR against renders of the original, such as 35dB
     #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels)]
     pub(super) min_psnr: Option<f64>,
     /// Smallest output that loses at most this much PSNR against the photographs of --ground-truth, such as 0.5dB
@@ -203,8 +203,8 @@ pub(super) struct OutputSize {
     pub(super) ground_truth: Option<PathBuf>,
     /// Images to fit the Gaussians to: renders of the original, or photographs in --ground-truth [default: renders]
     ///
-    /// With photographs, a second fit follows the one to renders. It takes about as long as the first one. Its result
-    /// is kept if it raises the PSNR against photographs of cameras that the fit does not use.
+    /// With photographs, a fit to photographs follows the fit to renders and takes about as long. Its result is kept
+    /// if it raises the PSNR against photographs of cameras that the fit does not use.
     #[arg(long, help_heading = HOW_SMALL, value_name = "IMAGES", hide_short_help = true)]
     pub(super) toward: Option<FitTargetArg>,
 }
@@ -212,8 +212,8 @@ pub(super) struct OutputSize {
 /// Gaussians that the user keeps or drops.
 #[derive(Debug, Args)]
 pub(super) struct OverrideArgs {
-    /// Never remove, merge or move a Gaussian whose center is in this box at the reference frame. Box: minimum corner,
-    /// then maximum corner
+    /// Never remove, merge or move a Gaussian whose center is in this box at the frame in which most Gaussians are
+    /// alive. Box: minimum corner, then maximum corner
     #[arg(long, help_heading = WHAT_STAYS, value_name = "X0,Y0,Z0,X1,Y1,Z1", hide_short_help = true, value_parser = parse_box, allow_hyphen_values = true)]
     pub(super) keep_box: Option<[f64; 6]>,
     /// Never remove, merge or move these Gaussians: a file with one id per line, or a list such as 3,10-20
@@ -252,17 +252,18 @@ pub(super) struct Render {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
-    /// Frame to render, from 0
+    /// Render one view: the frame with this number, the first is 0. Needs --view and -o
     #[arg(long, value_name = "T", requires = "view")]
     pub(super) frame: Option<u32>,
-    /// View to render, or the view of --video
+    /// Number of the view (the camera) to render with --frame or --video; the first is 0. If training and test cameras
+    /// have the same numbers, also give --split
     #[arg(long, value_name = "V", conflicts_with = "all")]
     pub(super) view: Option<u32>,
     /// Render every view of the split into a folder, as tNNN_vNN files
     #[arg(long)]
     pub(super) all: bool,
-    /// Write a video with one image per frame, from --view [default: the first] or along --path. NAME.png or NAME.apng:
-    /// animated PNG, lossless. NAME.gif: animated GIF. NAME.mp4 or NAME.webm: video, needs ffmpeg
+    /// Write a video with one image per frame, seen from --view [default: the first view] or along --path. NAME.png or
+    /// NAME.apng: animated PNG, lossless. NAME.gif: animated GIF. NAME.mp4 or NAME.webm: needs ffmpeg
     #[arg(long, value_name = "FILE")]
     pub(super) video: Option<PathBuf>,
     /// Move the camera of --video through these views, such as 0,2,5 [default: all views of the split]
@@ -274,7 +275,7 @@ pub(super) struct Render {
     /// Model to show beside the input in --video, with the same frames
     #[arg(long, value_name = "MODEL")]
     pub(super) beside: Option<PathBuf>,
-    /// Split of the views to render [default: with --all or --path test, else val, else all; otherwise all]
+    /// Split of the views to render [default: with --all or --path: test, else val, else all; otherwise: all]
     #[arg(long, value_enum)]
     pub(super) split: Option<SplitArg>,
     /// Format of the images of --all [default: png]
@@ -323,7 +324,7 @@ pub(super) struct CompareArgs {
     pub(super) iteration: Option<u32>,
     #[command(flatten)]
     pub(super) trained: Trained,
-    /// Accept folders of PLY frames with missing frame numbers
+    /// Accept folders of PLY frames with missing frame numbers or with entries that are no files
     #[arg(long)]
     pub(super) allow_gaps: bool,
     /// Tracking of frames, as for `compress` [default: auto]
@@ -333,11 +334,11 @@ pub(super) struct CompareArgs {
     pub(super) memory: Memory,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
-    /// Split of the views [default: test, else val, else all]
+    /// Split of the data set whose views are compared [default: test, else val, else all]
     #[arg(long, value_enum)]
     pub(super) split: Option<SplitArg>,
     /// Folder of photographs with which both models are also compared. File names: as in the camera file, else
-    /// tNNN_vNN.png
+    /// tNNN_vNN.png (frame, view)
     #[arg(long, value_name = "FOLDER")]
     pub(super) ground_truth: Option<PathBuf>,
     /// Maximum number of frames, spread evenly [default: all]
@@ -367,7 +368,7 @@ pub(super) struct ReportArgs {
     /// precision.json that `precision` wrote, to include its plots
     #[arg(long, value_name = "FILE")]
     pub(super) precision: Option<PathBuf>,
-    /// Measure the time of a render before and after; these times differ between runs
+    /// Measure the time of a render of the original and of the compressed model; times differ from run to run
     #[arg(long)]
     pub(super) render_time: bool,
     /// Output folder: report.html, and its data as JSON and CSV
@@ -387,7 +388,7 @@ pub(super) struct ReportArgs {
 pub(super) struct Evaluate {
     #[command(flatten)]
     pub(super) models: CompareArgs,
-    /// Write the scores of every view
+    /// Also write the PSNR, SSIM and other results of every view to this CSV file
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,
     #[command(flatten)]
@@ -447,9 +448,9 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// Output. NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd: a file of this format. A
-    /// folder: the model in an archive, one PLY per frame of a sequence, or a model of the input's own format. `-`: a
-    /// frame stream on standard output (format/STREAM.md)
+    /// Output. NAME.gsz, .gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd: a file of this
+    /// format. A folder: the model that an archive contains, one PLY per frame of a sequence, or a model in the input's
+    /// own format. `-`: a frame stream on standard output (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// Path of the output: the same as the argument OUTPUT, in the form that other commands use
@@ -463,12 +464,15 @@ pub(super) struct Convert {
     )]
     pub(super) output_option: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) cameras: Cameras,
+    pub(super) cameras: CameraFile,
+    /// Split of the data set whose views decide the quantization of an output NAME.gsz [default: train]
+    #[arg(long, value_enum, help_heading = CAMERAS)]
+    pub(super) split: Option<SplitArg>,
     #[command(flatten)]
     pub(super) format: OutputFormat,
     /// Maximum error of an attribute in a .gseq, such as `position=1e-3` or `position=0.01%` of the scene's extent.
-    /// Units: scene units, components of quaternions, logs of scales, opacity logits, SH coefficients. Attributes that
-    /// are not named keep every bit. Every value is checked as it is written, and the file states its bounds
+    /// Units: scene units, components of quaternions, logs of scales, opacity logits, SH coefficients. Attributes
+    /// without a bound keep every bit. Every written value is checked, and the file states its bounds
     #[arg(long, value_name = "ATTRIBUTE=BOUND", value_delimiter = ',', conflicts_with = "raw")]
     pub(super) max_error: Vec<MaxError>,
     /// Store the blocks of values (tiles) of a .gseq uncompressed, so that programs can use them in place

@@ -22,13 +22,13 @@ const TOP_TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage
 /// Examples in the help of the program.
 const EXAMPLES: &str = "\
 Examples:
-  splatsieve demo                                    try it on a built-in scene
+  splatsieve demo                                             a built-in scene
   splatsieve compress model --cameras data -o small --ratio 10%
-  splatsieve evaluate model small --cameras data     what was lost
-  splatsieve report model small -o page              the same, as a page
-  splatsieve view model small -o scene.html          both moving, in a browser
-  splatsieve compress model -o small.gsz             archive, the smallest
-  splatsieve convert small.gsz small                 the model folder in it
+  splatsieve evaluate model small --cameras data              what was lost
+  splatsieve report model small --cameras data -o page        the same, as page
+  splatsieve view model small --cameras data -o compare.html  plays both
+  splatsieve compress model --cameras data -o small.gsz       smallest file
+  splatsieve convert small.gsz small                          unpacks this file
 `splatsieve COMMAND -h` prints examples and common options, `--help` all options.";
 
 /// Groups of commands in the help of the program: the heading of each group, and the names of its commands.
@@ -44,73 +44,73 @@ const COMMAND_EXAMPLES: &[(&str, &[&str])] = &[
     (
         "compress",
         &[
-            "splatsieve compress model --cameras data -o small     drop-in result",
-            "splatsieve compress model -o small --ratio 30%        exactly 30% of them",
-            "splatsieve compress model -o small --min-psnr 35dB    fewest at this PSNR",
-            "splatsieve compress model -o small --size 5MB         best that fits",
-            "splatsieve compress model -o small.gsz                archive, the smallest",
-            "splatsieve compress model -o small --dry-run          plan, time, memory",
-            "splatsieve compress model -o small --set refine_steps=3000",
-            "exporter | splatsieve compress - -o small.gseq        frames as they come",
+            "splatsieve compress model --cameras data -o small     opens as model did",
+            "splatsieve compress model --cameras data -o small --ratio 30%",
+            "splatsieve compress model --cameras data -o small --min-psnr 35dB",
+            "splatsieve compress model --cameras data -o small --size 5MB",
+            "splatsieve compress model --cameras data -o small.gsz  smallest file",
+            "splatsieve compress model --cameras data -o small --dry-run  plan only",
+            "splatsieve compress model --cameras data -o small --set refine_steps=3000",
+            "exporter | splatsieve compress - --cameras data -o small.gseq",
         ],
     ),
     (
         "score",
         &[
-            "splatsieve score model --cameras data -o rows.npz  nothing is removed",
-            "splatsieve score model -o rows.csv --preset paper",
+            "splatsieve score model --cameras data -o scores.npz",
+            "splatsieve score model --cameras data -o scores.csv --preset paper",
         ],
     ),
     (
         "render",
         &[
-            "splatsieve render model --frame 0 --view 1 -o x.png  one view",
-            "splatsieve render model --all -o renders             all test views",
-            "splatsieve render model --video x.mp4                the first view",
-            "splatsieve render model --video x.gif --path 0,3,5 --beside small",
+            "splatsieve render model --cameras data --frame 0 --view 1 -o x.png",
+            "splatsieve render model --cameras data --all -o renders  all test views",
+            "splatsieve render model --cameras data --video x.mp4  from the first view",
+            "splatsieve render model --cameras data --video x.gif --path --beside small",
         ],
     ),
     (
         "evaluate",
         &[
             "splatsieve evaluate model small --cameras data       on test views",
-            "splatsieve evaluate model small --ground-truth data  against photographs",
-            "splatsieve evaluate model small --flip --csv scores.csv",
+            "splatsieve evaluate model small --cameras data --ground-truth data",
+            "splatsieve evaluate model small --cameras data --flip --csv views.csv",
         ],
     ),
     (
         "sweep",
         &[
-            "splatsieve sweep model --cameras data -o curves      methods and fractions",
-            "splatsieve sweep model -o curves --methods default,paper --fractions 50%,20%",
+            "splatsieve sweep model --cameras data -o curves      up to 55 complete runs",
+            "splatsieve sweep model --cameras data -o curves --methods default,paper",
         ],
     ),
     (
         "precision",
         &[
             "splatsieve precision model --cameras data -o page    error against run time",
-            "splatsieve precision model -o page --knobs scoring,rounds",
+            "splatsieve precision model --cameras data -o page --knobs scoring,rounds",
         ],
     ),
     (
         "report",
         &[
-            "splatsieve report model small -o page                 open page/report.html",
-            "splatsieve report model small smaller -o page         several results",
+            "splatsieve report model small --cameras data -o page  see page/report.html",
+            "splatsieve report model small smaller --cameras data -o page",
         ],
     ),
     (
         "view",
         &[
-            "splatsieve view model small --cameras data -o scene.html  side by side",
-            "splatsieve view scan.ply -o scan.html                a still",
+            "splatsieve view model small --cameras data -o compare.html  side by side",
+            "splatsieve view scan.ply -o scan.html                a scene without motion",
             "splatsieve view long.gseq --max-frames 600 -o scene  open scene/index.html",
         ],
     ),
     (
         "convert",
         &[
-            "splatsieve convert small.gsz small                   the model in an archive",
+            "splatsieve convert small.gsz small                   unpack the model",
             "splatsieve convert model scene.splatv --cameras data  for splaTV and WebGS",
             "splatsieve convert scan.ply scan.spz                 for web viewers",
             "splatsieve convert scene.gseq frames                 one PLY per frame",
@@ -130,7 +130,13 @@ const COMMAND_EXAMPLES: &[(&str, &[&str])] = &[
     ("demo", &["splatsieve demo -o folder                            pages to look at"]),
     ("test-scene", &["splatsieve test-scene -o folder --gaussians 2000     a scene for tests"]),
     ("selfcheck", &["splatsieve selfcheck                                 are the numbers right?"]),
-    ("recipe", &["splatsieve recipe --preset paper > recipe.toml       every parameter"]),
+    (
+        "recipe",
+        &[
+            "splatsieve recipe > recipe.toml                      the default, to edit",
+            "splatsieve recipe --preset paper                     explains every parameter",
+        ],
+    ),
     ("completions", &["splatsieve completions bash > splatsieve.bash"]),
     ("man", &["splatsieve man share/man/man1                       man splatsieve-compress"]),
 ];

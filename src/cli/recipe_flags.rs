@@ -118,11 +118,11 @@ impl Args for RecipeFlags {
         let arg = |name: &'static str| Arg::new(name).long(name).help_heading(HEADING);
         let preset = arg("preset")
             .value_parser(PRESETS.map(|(name, _)| name))
-            .help("Recipe to start from: `default`, the best known; `paper`, as published; `gentle`; `strong`");
+            .help("Recipe to start from: `default`, the best known; `paper`, as published; `gentle`, removes less; `strong`, removes more. `paper` and `gentle` do not refine");
         let file = arg("recipe")
             .value_name("FILE")
             .value_parser(clap::value_parser!(PathBuf))
-            .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run");
+            .help("TOML file with any of the parameters; others come from --preset. The recipe.toml beside a result repeats its run");
         let effort = arg("effort")
             .value_parser(Effort::ALL.map(Effort::name))
             .help("Time to spend on quality: `fast`, a third of the refinement steps and coarser ranking; `best`, three times the steps");

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::args::{
-    CacheFolder, Cli, CommandArgs, Completions, Compress, Convert, Demo, DryRun, Evaluate, InfoArgs, Man,
+    CacheFolder, Cameras, Cli, CommandArgs, Completions, Compress, Convert, Demo, DryRun, Evaluate, InfoArgs, Man,
     PrecisionArgs, Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene, ViewArgs,
 };
 use super::help;
@@ -235,7 +235,8 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     let storing = storage_precision(&args);
     let output = (!is_stdout).then_some(path.as_path());
     let has_cache = args.kept.cache.is_some();
-    let mut input = input_options(args.input, Some(args.cameras), output, events);
+    let cameras = Cameras { file: args.cameras, split: args.split };
+    let mut input = input_options(args.input, Some(cameras), output, events);
     input.work = cache_request(args.kept);
     let kind = requested_kind(&args.format, &path)?;
     let is_container = !is_stdout && convert::is_container(&path, kind);

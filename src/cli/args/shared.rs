@@ -26,12 +26,12 @@ pub(in crate::cli) struct Input {
     /// Accept a folder of PLY frames with missing frame numbers or with entries that are no files
     #[arg(long, hide_short_help = true)]
     pub(in crate::cli) allow_gaps: bool,
-    /// Tracking: find which Gaussian of one frame is which of the next, for frames that do not keep the order of their
-    /// Gaussians [default: auto]
+    /// When to match the Gaussians of each frame with those of the next (tracking), for sequences whose frames list
+    /// their Gaussians in different orders [default: auto]
     #[arg(long, hide_short_help = true)]
     pub(in crate::cli) link: Option<LinkArg>,
-    /// Folder for temporary files of the run: received or tracked frames, and what does not fit into --memory [default:
-    /// the folder of the output, else the system's]
+    /// Folder for temporary files: frames of a stream, tracked frames, and data that do not fit into --memory [default:
+    /// the folder that contains the output, else the system's folder for temporary files]
     #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
     pub(in crate::cli) scratch_dir: Option<PathBuf>,
     #[command(flatten)]
@@ -76,11 +76,11 @@ pub(in crate::cli) enum Rot4d {
 /// Cache folder of a run, for resuming it and for dividing it among several processes.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct CacheArgs {
-    /// Keep the results of finished stages in this folder: an interrupted run continues from there
+    /// Keep the results of finished stages in this folder. After an interruption, the same command continues from them
     #[arg(long, help_heading = CACHE, value_name = "FOLDER")]
     pub(in crate::cli) cache: Option<PathBuf>,
-    /// Compute only shard I of N of the next stage that can be divided, and keep it in the cache; a run without this
-    /// option joins the shards and does the rest
+    /// Compute only shard I (1 to N) of the next stage that can be divided, and store it in --cache. A run without this
+    /// option joins the shards and continues
     #[arg(long, help_heading = CACHE, value_name = "I/N", requires = "cache", hide_short_help = true)]
     pub(in crate::cli) shard: Option<Shard>,
 }
@@ -103,7 +103,8 @@ impl Earlier {
 /// Memory limit.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Memory {
-    /// Memory limit, such as 512MiB or 4GB [default: a quarter of the machine's memory]
+    /// Memory limit, such as 512MiB or 4GB [default: a quarter of the memory that this process may use, which is the
+    /// machine's memory or, if less, the limit of its control group, Slurm or Windows job, or ulimit]
     ///
     /// The limit does not change the result, except that refinement is reduced or left out if it needs more; the
     /// summary says so.
@@ -125,7 +126,8 @@ pub(in crate::cli) struct CameraFile {
     /// Number of evenly spaced frames, for a model that is continuous in time [default: the times of the cameras]
     #[arg(long, help_heading = CAMERAS, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(in crate::cli) frames: Option<u32>,
-    /// Width and height of the views, if the camera file has none; views of COLMAP, NeRFies and LLFF are scaled to it
+    /// Width and height of the views in pixels, if the camera file has none. Views of COLMAP, NeRFies and LLFF are
+    /// scaled to it
     #[arg(long, help_heading = CAMERAS, value_name = "WxH", value_parser = parse_size)]
     pub(in crate::cli) resolution: Option<(u32, u32)>,
     /// Times of the images, if the camera file has none (COLMAP, cameras.json). names: the number in each image name.
@@ -140,7 +142,7 @@ pub(in crate::cli) struct CameraFile {
 pub(in crate::cli) struct Cameras {
     #[command(flatten)]
     pub(in crate::cli) file: CameraFile,
-    /// Split of the views that Gaussians are scored by [default: train]
+    /// Split of the data set whose views Gaussians are scored by [default: train]
     #[arg(long, value_enum, help_heading = CAMERAS)]
     pub(in crate::cli) split: Option<SplitArg>,
 }

@@ -16,23 +16,24 @@ pub(in crate::cli) struct Sweep {
     pub(in crate::cli) input: Input,
     #[command(flatten)]
     pub(in crate::cli) cameras: CameraFile,
-    /// Methods to compare. default, paper: the presets. no-refine: default without refinement. paper-prune,
-    /// paper-merge: paper with pruning alone, with merging alone. visible, projected, opacity, scale: pruning by
-    /// visible contribution, projected coverage, opacity or scale alone. random: pruning at random
+    /// Methods to compare. default, paper: the presets. no-refine: default without refinement. paper-prune: paper
+    /// without merging. paper-merge: paper without pruning. visible, projected, opacity, scale: pruning by visible
+    /// contribution, projected coverage, opacity or scale alone. random: pruning at random
     #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
           value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
     pub(in crate::cli) methods: Vec<String>,
     /// Fractions of the Gaussians to keep, such as 0.5,20%,10x
     #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_value = "0.8,0.6,0.4,0.2,0.1", value_parser = parse_ratio)]
     pub(in crate::cli) fractions: Vec<f64>,
-    /// Also run `default` with these numbers of final refinement steps, for curves of error against run time; 0: no
-    /// refinement. The numbers of steps before prune steps change in proportion
+    /// Also run `default` with each of these numbers of final refinement steps, for a curve of error against run time.
+    /// 0: no refinement. The number of steps before each prune step changes in proportion
     #[arg(long, value_name = "STEPS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=1_000_000))]
     pub(in crate::cli) steps: Vec<u32>,
     /// Fraction of the Gaussians to keep with --steps
     #[arg(long, value_name = "FRACTION", default_value_t = 0.1, requires = "steps")]
     pub(in crate::cli) steps_at: f64,
-    /// Number of runs per setting; the reported time is their median
+    /// Number of runs per method and fraction; the reported time is their median. By default up to 55 complete runs: 10
+    /// methods at 5 fractions, and 5 methods also at the size that they choose
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
     pub(in crate::cli) repeat: u32,
     /// Maximum number of frames to compare, spread evenly
@@ -57,11 +58,11 @@ pub(in crate::cli) struct PrecisionArgs {
     pub(in crate::cli) input: Input,
     #[command(flatten)]
     pub(in crate::cli) cameras: CameraFile,
-    /// Settings to vary. scoring: views, and strides of pixels, views and frames, of the first scoring pass. rounds:
-    /// views of a pruning round, and fraction that it keeps. percentiles: bits of the histogram that percentiles are
-    /// read from. sums: f32 and f64 arithmetic. merging: radius, and number of passes. refining: steps, and number of
-    /// target views. machine: threads, and memory limit [default: all; for a long input without the last three, which
-    /// take complete runs]
+    /// Groups of settings to vary. scoring: number of views, and strides of pixels, views and frames, of the first
+    /// scoring pass. rounds: number of views of a pruning round, and fraction of the Gaussians that it keeps.
+    /// percentiles: resolution of the histogram from which percentiles are read. sums: f32 or f64 arithmetic. merging:
+    /// radius, and number of passes. refining: number of steps and of target views. machine: threads and memory limit
+    /// [default: all; for a long input all except the last three, which need complete runs]
     #[arg(long, value_name = "KNOBS", value_delimiter = ',',
           value_parser = clap::builder::PossibleValuesParser::new(Knob::ALL.map(Knob::name)))]
     pub(in crate::cli) knobs: Vec<String>,
