@@ -202,8 +202,8 @@ pub trait FrameSource: Send + Sync {
     }
 }
 
-/// Differentiable function that computes the states of Gaussians from stored parameters, which are the same for all
-/// frames.
+/// Deformation field, or another differentiable motion model: computes the state of each Gaussian at a frame from its
+/// stored parameters, which do not depend on time.
 pub trait Deformation: Sync {
     /// Returns the stored parameters of all Gaussians.
     fn stored(&self) -> &StoredParams;
@@ -212,12 +212,13 @@ pub trait Deformation: Sync {
     /// [`DeformedGaussians::jacobian`] can compute.
     fn movable(&self) -> Attributes;
 
-    /// Returns the Gaussians with the parameters `stored`, to be evaluated at several frames. This call does all the
+    /// Prepares the evaluation of the Gaussians with the parameters `stored` at several frames. This call does all the
     /// work that does not depend on time.
     fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a>;
 }
 
-/// Gaussians with given stored parameters, whose states a [`Deformation`] computes at any frame.
+/// [`Deformation`] that is prepared for one set of stored parameters. Computes the states of these Gaussians at any
+/// frame, and their derivatives.
 pub trait DeformedGaussians {
     /// Computes the state of all Gaussians at `frame`. Writes only the attributes `want` to `out`, and resizes these.
     ///

@@ -249,8 +249,9 @@ impl Reader {
         self.times.len().div_ceil(self.layout.frame_block as usize) as u32
     }
 
-    /// Returns whether the values of a column differ between frames. This follows from the index alone: they do not
-    /// differ if all tiles of the column are constant and share their stored bytes.
+    /// Returns whether the values of column `column` (an attribute) may differ between frames. They are known to be the
+    /// same at all frames if all tiles of the column are constant and, for each block of Gaussians, share their stored
+    /// bytes. Uses only the index of the file.
     ///
     /// # Panics
     /// Panics if there is no such column.

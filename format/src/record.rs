@@ -57,7 +57,7 @@ pub(crate) struct FooterRecord {
     pub(crate) header_checksum: u64,
 }
 
-/// Header of a record, of one of the three kinds that a container has.
+/// Header of a record. A container has records of three kinds: tiles (values), time stamps, and one footer (index).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Record {
     Tile(TileRecord),

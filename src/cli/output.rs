@@ -74,8 +74,9 @@ pub(super) fn is_terminal() -> bool {
     stdout().is_terminal()
 }
 
-/// Returns the JSON text `text` with every character that [`printable`] replaces written as an escape `\uXXXX`. Such
-/// characters occur only inside the strings of the JSON text, so the values that it encodes stay the same.
+/// Replaces every character of the JSON text `text` that is unsafe on a terminal (see [`printable`]) by its JSON escape
+/// `\uXXXX`, and returns the text. The encoded values stay the same, because in JSON these characters occur only inside
+/// strings.
 fn json_escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

@@ -101,8 +101,8 @@ impl FitError {
         self.max_opacity_error = self.max_opacity_error.max(opacity.abs());
     }
 
-    /// Returns the errors over the states of both `self` and `other`: adds the counts and sums, and takes the larger
-    /// value of each largest difference.
+    /// Combines the errors of two disjoint sets of compared states and returns the errors over both sets. Counts and
+    /// sums are added; of each maximum error, the larger one is taken.
     pub fn merged_with(self, other: FitError) -> FitError {
         FitError {
             states: self.states + other.states,

@@ -47,8 +47,8 @@ pub struct Workload {
     pub varying: Attributes,
     /// Memory that the input and its readers take, and numbers of frames and Gaussians per tile of the input.
     pub input: MemoryProfile,
-    /// Number of different view numbers among the views of all cameras. One view number stands for one viewpoint, seen
-    /// at one or several times.
+    /// Number of viewpoints: distinct view numbers among the views of all cameras. Views with the same number show the
+    /// scene from one viewpoint at different times.
     pub viewpoints: u64,
     /// Number of pixels per image of the camera with the largest images.
     pub pixels: u64,

@@ -213,8 +213,8 @@ pub trait InputModel: Send + Sync {
         false
     }
 
-    /// Returns whether an archive of this input is a container of its frames (`.gseq`) with a bounded error per value,
-    /// instead of a `.gsz`.
+    /// Returns whether an archive of this input holds its frames, instead of the parameters of a model. Such an archive
+    /// is a container in the format `.gseq` with an error bound for each attribute.
     fn archives_as_frames(&self) -> bool {
         self.has_explicit_frames()
     }

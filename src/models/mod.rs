@@ -66,10 +66,9 @@ const MODEL_FORMATS: [ModelFormat; 17] = [
     archive::ENTRY,
 ];
 
-/// Returns the background color that a model was trained with. `cameras` is the model folder or a file in it.
-///
-/// Returns white if the file `cfg_args` in the folder has `white_background=True`, as 3DGS and trainers derived from it
-/// write it. Returns `None` if this key is false or missing, or if the file cannot be read.
+/// Returns white if the model in the folder `cameras`, or in the folder of the file `cameras`, was trained with a white
+/// background: its file `cfg_args`, which 3DGS and trainers derived from it write, has `white_background=True`. Returns
+/// `None` if this key is false or missing, or if the file cannot be read.
 pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
     let folder = if cameras.is_dir() { cameras } else { cameras.parent()? };
     let arguments = Arguments::read(&folder.join("cfg_args")).ok()?;

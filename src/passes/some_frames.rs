@@ -1,10 +1,11 @@
-//! Source of some frames of another source, as a sequence with its own frame indices.
+//! Frame source that shows only chosen frames of another source, renumbered from 0.
 
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
 use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 
-/// Source of some frames of another source. Frame k of this source is the k-th of the chosen frames.
+/// Frame source that shows only chosen frames of another source. Frame k of this source is the k-th chosen frame,
+/// counted from 0.
 pub struct SomeFrames<'a> {
     source: &'a dyn FrameSource,
     /// Chosen frames of `source`, increasing.
@@ -13,15 +14,14 @@ pub struct SomeFrames<'a> {
 }
 
 impl<'a> SomeFrames<'a> {
-    /// Creates a source that consists of some frames of `source`. `frames` lists the indices of these frames and must
-    /// be in increasing order.
+    /// Creates a source that shows only the frames of `source` with the indices `frames`, in increasing order.
     pub fn new(source: &'a dyn FrameSource, frames: Vec<usize>) -> SomeFrames<'a> {
         let times = frames.iter().map(|&frame| source.info().times[frame]).collect();
         SomeFrames { source, info: SequenceInfo { times, ..source.info().clone() }, frames }
     }
 
-    /// Returns the schedule (list of the views at each frame) of this source. `schedule` is the schedule of the
-    /// original source, with all its frames.
+    /// Returns the schedule (list of the views at each frame) for the chosen frames. `schedule` lists the views at all
+    /// frames of the original source.
     pub fn views(&self, schedule: &ViewSchedule) -> ViewSchedule {
         let mut chosen = ViewSchedule::new(schedule.cameras.clone());
         self.frames.iter().for_each(|&frame| chosen.push_frames(1, schedule.views(frame)));

@@ -56,11 +56,10 @@ pub struct RunOptions {
     pub target_ratio: Option<f64>,
     /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     pub min_psnr: Option<f64>,
-    /// Maximum amount, dB, by which the mean PSNR against photographs may be lower for the output than for the original
-    /// model.
+    /// Maximum loss of mean PSNR against photographs, dB: PSNR of the original minus PSNR of the output.
     pub max_loss: Option<f64>,
-    /// Folder of the photographs for `max_loss` and `toward`. In a recipe file, the path is relative to the folder of
-    /// the file.
+    /// Folder of the photographs: of test views if `max_loss` is given, of training views if `toward` is photographs. A
+    /// relative path in a recipe file starts at the folder of the recipe file.
     pub ground_truth: Option<PathBuf>,
     /// Images to which the result is fitted.
     #[serde(skip_serializing_if = "FitTarget::is_renders")]

@@ -11,8 +11,9 @@ use crate::passes::views::{RenderedSource, Workers};
 use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// Number of rendered pixels of a view per Gaussian, for a ranking by removal errors (squared errors of renders caused
-/// by removing one Gaussian). More pixels change the ranking less than a different choice of views does.
+/// Number of pixels to render in each view, divided by the number of Gaussians, when Gaussians are ranked by removal
+/// error (squared error of renders if one Gaussian is removed). More pixels would change the ranking less than other
+/// views would.
 const PIXELS_PER_GAUSSIAN: f64 = 1.0;
 
 /// Returns the stride n for the renders by which `count` Gaussians are ranked: only every n-th column and row of pixels

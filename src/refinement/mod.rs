@@ -215,8 +215,8 @@ impl RefineStage {
         start_count(self.min_start_count_fraction(), wanted, all)
     }
 
-    /// Estimates the memory and time that this stage needs for the input `work`: frame states, the optimizer, and a
-    /// view with its gradient.
+    /// Returns the resource estimate (bytes of memory, seconds) of refinement for the input `work`. The memory holds
+    /// frame states, the optimizer, and one render with its gradient.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         self.estimate_for_views(work, limits, targets::view_counts(self.target_views, work.pixels))
     }

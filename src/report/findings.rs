@@ -40,9 +40,10 @@ pub struct CompressedModelData {
     /// Verdict in two or three sentences: size of the model, how visible its differences from the original are, and
     /// failure modes.
     pub verdict: String,
-    /// Comparison with the original: mean scores over all renders, by view and by frame.
+    /// Comparison of renders with renders of the original (PSNR, SSIM and other measures): means over all views, for
+    /// each view number and for each frame.
     pub evaluation: Evaluation,
-    /// Scores of every compared render.
+    /// Image quality (PSNR, SSIM and other measures) of every compared render.
     pub view_scores: Vec<ViewScores>,
     /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]

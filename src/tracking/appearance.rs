@@ -69,7 +69,7 @@ impl ComparedAppearance {
         }
     }
 
-    /// Returns a copy of this appearance with the position `position`, scene units.
+    /// Returns a copy with `position` (x, y, z in scene units) as position; all other values stay the same.
     pub(super) fn at(self, position: [f32; 3]) -> ComparedAppearance {
         ComparedAppearance { position, ..self }
     }

@@ -33,9 +33,10 @@ pub struct TileFrames {
 enum Counted {
     #[default]
     Nothing,
-    /// Of the raw tile, only the frame that was read last has been counted as read. Contains the number of this frame.
+    /// One frame of the raw tile is counted at a time; the contained index, from 0 within the tile, is that of the last
+    /// counted frame. If it is read again at once, it is not counted again.
     Frame(usize),
-    /// The whole raw tile has been counted as read, because all of it was read to check its checksum.
+    /// The whole raw tile is counted, because [`Reader::load`] read all of it to check its checksum.
     Tile,
 }
 

@@ -161,10 +161,10 @@ impl Bench<'_> {
         Target::Count(self.kept as u64)
     }
 
-    /// Compresses the input by `recipe` in complete runs of the program. Returns the error of the result's renders,
-    /// their PSNR, and the cost (time and memory) of the runs.
-    /// - `value`: value of the varied parameter in `recipe`
-    /// - `step`: step size h of this value (how coarse it is); an error of order p is proportional to h^p
+    /// Compresses the input by `recipe` in one or more complete runs. Then compares renders of the result with renders
+    /// of the original. Returns the error and the mean PSNR of these renders, and the time and memory of a run.
+    /// - `value`: value that the varied parameter has in `recipe`.
+    /// - `step`: coarseness h of this value, such as 1 / (number of views). An error of order p is proportional to h^p.
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.views.iter().map(|view| view.loss.psnr).collect();

@@ -164,9 +164,11 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     Ok(better)
 }
 
-/// Computes all stored parameters of the proxies `made` (Gaussians that replace merged ones) except their positions,
-/// and writes them to `made`. `wanted` holds the target states of all proxies, one entry for each of `frames`.
-/// `leaders` holds the id of the most important member of each cluster.
+/// Fits the rotation, scale, opacity and SH coefficients of proxies (Gaussians that replace merged clusters), so that
+/// their states come close to target states, and writes them to `proxies`. Positions are kept.
+/// - `leaders`: id of the most important member of each cluster.
+/// - `frames`: frames at which states are compared.
+/// - `targets`: for each of these frames, the target states of all proxies.
 ///
 /// The parameters start as those of the leaders. Then they are corrected [`CORRECTIONS`] times: the difference between
 /// the target and the state of the proxy, averaged over `frames`, is added. One correction suffices if the network's
@@ -174,42 +176,43 @@ fn gauss_newton_step<L: NetworkMotionModel>(
 /// the correction with the smallest difference from the target.
 fn fit_parameters<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
-    made: &mut StoredParams,
+    proxies: &mut StoredParams,
     leaders: &[u32],
     frames: &[usize],
-    wanted: &[Gaussians],
+    targets: &[Gaussians],
 ) -> Result<()> {
-    let own = &model.raw().gaussians;
-    (made.gaussians.rotation, made.gaussians.log_scale) = (own.rotation.pick(leaders), own.log_scale.pick(leaders));
-    (made.gaussians.opacity_logit, made.gaussians.sh) = (own.opacity_logit.pick(leaders), own.sh.pick(leaders));
-    let (mut best, mut least) = (made.clone(), vec![f64::INFINITY; made.len()]);
+    let raw = &model.raw().gaussians;
+    (proxies.gaussians.rotation, proxies.gaussians.log_scale) =
+        (raw.rotation.pick(leaders), raw.log_scale.pick(leaders));
+    (proxies.gaussians.opacity_logit, proxies.gaussians.sh) = (raw.opacity_logit.pick(leaders), raw.sh.pick(leaders));
+    let (mut best, mut least) = (proxies.clone(), vec![f64::INFINITY; proxies.len()]);
     let share = 1.0 / frames.len().max(1) as f64;
     for correction in 0..=CORRECTIONS {
-        let mut all = vec![StateDifference::default(); made.len()];
-        let mut state = Gaussians::zeros(0, own.sh_degree());
-        for (&frame, wanted) in frames.iter().zip(wanted) {
-            model.with_params(made).state(frame, Attributes::all(), &mut state)?;
-            all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add_frame(wanted, &state, row));
-            if wanted.sh.len() == made.len() {
+        let mut all = vec![StateDifference::default(); proxies.len()];
+        let mut state = Gaussians::zeros(0, raw.sh_degree());
+        for (&frame, target) in frames.iter().zip(targets) {
+            model.with_params(proxies).state(frame, Attributes::all(), &mut state)?;
+            all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add_frame(target, &state, row));
+            if target.sh.len() == proxies.len() {
                 // SH coefficients are compared at one frame only: their change over time is the same at all frames.
                 for c in 0..state.sh.width() {
-                    let more = wanted.sh.plane(c).iter().zip(state.sh.plane(c)).map(|(to, from)| to - from);
-                    made.gaussians.sh.plane_mut(c).iter_mut().zip(more).for_each(|(of, more)| *of += more);
+                    let more = target.sh.plane(c).iter().zip(state.sh.plane(c)).map(|(to, from)| to - from);
+                    proxies.gaussians.sh.plane_mut(c).iter_mut().zip(more).for_each(|(of, more)| *of += more);
                 }
             }
         }
         for (row, sum) in all.iter().enumerate() {
             if sum.off < least[row] {
                 least[row] = sum.off;
-                best.set_row(row, made, row);
+                best.set_row(row, proxies, row);
             }
             if correction < CORRECTIONS {
-                sum.apply::<L>(share, &mut made.gaussians, row);
+                sum.apply::<L>(share, &mut proxies.gaussians, row);
             }
         }
     }
     // Opacities and SH coefficients agree with the target after the first correction.
-    (made.gaussians.rotation, made.gaussians.log_scale) = (best.gaussians.rotation, best.gaussians.log_scale);
+    (proxies.gaussians.rotation, proxies.gaussians.log_scale) = (best.gaussians.rotation, best.gaussians.log_scale);
     Ok(())
 }
 

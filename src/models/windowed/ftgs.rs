@@ -31,7 +31,7 @@ pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
         Ok(Box::new(WindowedModel {
             path: path.to_owned(),
             name: "ftgs-player model",
-            own: OutputKind::Ftgs,
+            default_output: OutputKind::Ftgs,
             timing: TimeOrigin::Continuous,
             notes: file.defects.notes(),
             model: MotionModelFrames::new(motion, file.params, sh_degree),

@@ -37,9 +37,9 @@ struct WindowedModel<L: ProxyRule> {
     path: PathBuf,
     /// Name of the format, shown to users.
     name: &'static str,
-    /// Kind of output that has the format of this file.
-    own: OutputKind,
-    /// Whether frames can be at any time, the file fixes their number, or the file fixes their times.
+    /// Output kind with the same format as this file.
+    default_output: OutputKind,
+    /// Origin of the frame times: the caller may choose any times, or the file gives the number or the times of frames.
     timing: TimeOrigin,
     /// Notes for the user: repairs and guesses made while the file was opened.
     notes: Vec<String>,
@@ -79,7 +79,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
-        match kind == self.own {
+        match kind == self.default_output {
             true => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
             false => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
@@ -133,7 +133,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
     }
 
     fn default_output_kind(&self) -> OutputKind {
-        self.own
+        self.default_output
     }
 
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {

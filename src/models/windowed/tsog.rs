@@ -66,6 +66,6 @@ fn opened<L: ProxyRule + 'static>(
     reopener: Option<Reopener>,
     notes: Vec<String>,
 ) -> Result<Box<dyn InputModel>> {
-    let (path, own) = (path.to_owned(), OutputKind::Tsog);
-    Ok(Box::new(WindowedModel { path, name: "TSOG model", own, timing, notes, model, reopener }))
+    let (path, default_output) = (path.to_owned(), OutputKind::Tsog);
+    Ok(Box::new(WindowedModel { path, name: "TSOG model", default_output, timing, notes, model, reopener }))
 }
