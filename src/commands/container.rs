@@ -306,8 +306,11 @@ fn pack_estimates(work: &Workload, storing: &StoragePrecision) -> Vec<ResourceEs
 /// Returns the resource estimate (memory and time) of writing all frames as a stream.
 fn unpack_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     let states = ("states", work.state_bytes(Attributes::all()));
-    let per_gaussian =
-        vec![states, ("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
+    let per_gaussian = vec![
+        states,
+        ("readers", work.input.reader),
+        ("kept frames", work.kept_frames_bytes(limits, Attributes::all())),
+    ];
     let seconds = 2.0 * work.reading_seconds(work.gaussian_count(), work.frames as f64);
     vec![ResourceEstimate {
         stage: "unpack",

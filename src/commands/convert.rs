@@ -121,10 +121,10 @@ fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstim
         (work.gaussians * work.frames).min(MAX_SINGLE_FRAME_GAUSSIANS as u64) * (state_bytes + FRAME_IMAGE_BYTES);
     fixed.push(("single frames", if kind == OutputKind::Tsog { single } else { 0 }));
     let per_gaussian = vec![
-        ("kept", 16),
+        ("survivors", 16),
         ("result", work.input.compressed + work.input.file + state_bytes),
         ("readers", work.input.reader),
-        ("held", if fits { 0 } else { work.kept_frames_bytes(limits, Attributes::all()) }),
+        ("kept frames", if fits { 0 } else { work.kept_frames_bytes(limits, Attributes::all()) }),
         ("fitted", if fits { FITTED_BYTES } else { 0 }),
         ("encoded", kind.encoding_bytes(state_bytes)),
     ];

@@ -199,7 +199,7 @@ impl MemoryPlan {
         );
         let _ = writeln!(
             out,
-            "  = {} program and threads + {} frames, cameras, index + {} tiles held + the largest stage:",
+            "  = {} program and threads + {} frames, cameras, index + {} decoded tiles + the largest stage:",
             format_bytes(PROGRAM_BYTES + PER_THREAD * work.threads),
             format_bytes(work.known_bytes()),
             format_bytes(self.base_bytes() - PROGRAM_BYTES - PER_THREAD * work.threads - work.known_bytes())

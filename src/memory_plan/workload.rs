@@ -195,7 +195,7 @@ impl Workload {
         let per_gaussian = vec![
             ("states", ready.min(limits.frames_together as u64) * self.state_bytes(columns)),
             ("readers", self.input.reader),
-            ("held", self.kept_frames_bytes(limits, columns)),
+            ("kept frames", self.kept_frames_bytes(limits, columns)),
             ("views", views_together * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
         ];
         let buffers = views_together * (render::STRIP_BYTES as u64 + 12 * self.pixels);
@@ -204,7 +204,7 @@ impl Workload {
 
     /// Returns the memory that a list of `views` views takes: its name in the memory plan, and its bytes.
     pub fn view_list_memory(views: f64) -> MemoryPart {
-        ("list", (PER_LISTED_VIEW as f64 * views).ceil() as u64)
+        ("view list", (PER_LISTED_VIEW as f64 * views).ceil() as u64)
     }
 
     /// Returns the memory of the buffers for writing the compressed model, as a container or as one file per frame.

@@ -136,7 +136,12 @@ impl SearchStage {
                 + work.render_seconds(self.target_views as f64, work.gaussian_count(), RENDER_COST),
             per_gaussian: [
                 scored_memory(limits),
-                vec![("states", whole), ("readers", reader), ("held", held), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)],
+                vec![
+                    ("states", whole),
+                    ("readers", reader),
+                    ("kept frames", held),
+                    ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
+                ],
             ]
             .concat(),
             fixed: vec![work.block_buffer_memory()],
@@ -148,14 +153,14 @@ impl SearchStage {
         need.seconds = SIZES_USUALLY_TRIED * seconds.max(measured.seconds);
         need.reads = SIZES_USUALLY_TRIED * reads.max(measured.reads);
         // A rendered view, and the image that it is compared with: once as read, once as used.
-        need.fixed.push(("compared", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
+        need.fixed.push(("compared images", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
         need.fixed.push(("field", work.input.fixed));
         // Each prune step removes a fifth of the Gaussians, starting from two fifths of all. So the models that are
         // kept after prune steps have together twice as many Gaussians as the input.
         need.per_gaussian.extend([
-            ("ways", 3 * (whole + 8)),
+            ("search models", 3 * (whole + 8)),
             ("result", work.input.compressed),
-            ("kept", choose::BYTES_PER_GAUSSIAN),
+            ("survivors", choose::BYTES_PER_GAUSSIAN),
         ]);
         need
     }

@@ -223,7 +223,7 @@ fn estimate(work: &Workload, limits: &Limits) -> ResourceEstimate {
         per_gaussian: vec![
             ("states", 2 * work.state_bytes(Attributes::all())),
             ("readers", work.input.reader),
-            ("held", work.kept_frames_bytes(limits, Attributes::all())),
+            ("kept frames", work.kept_frames_bytes(limits, Attributes::all())),
             ("points", 3 * points),
             per_gaussian,
         ],

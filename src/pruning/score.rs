@@ -38,7 +38,7 @@ pub const SCORING_BYTES_PER_GAUSSIAN: u64 =
 /// Gaussians to keep, and, if they are not in a scratch file, the statistics.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
     let rows = if limits.statistics_on_disk { 0 } else { StatisticRows::BYTES_PER_GAUSSIAN as u64 };
-    vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
+    vec![("statistics", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
 }
 
 /// Stage that scores the Gaussians and selects those to keep, with its parameters.
@@ -116,7 +116,7 @@ impl ScoreStage {
             reads: work.whole_input_reads(1, limits),
             seconds: 2e-6 * work.gaussian_count(),
             per_gaussian: vec![
-                ("rows", SCORING_BYTES_PER_GAUSSIAN),
+                ("statistics", SCORING_BYTES_PER_GAUSSIAN),
                 ("sorting", pruning::WORKING_BYTES_PER_GAUSSIAN as u64),
                 ("states", work.state_bytes(Attributes::POSITION | Attributes::LOG_SCALE)),
             ],

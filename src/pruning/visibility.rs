@@ -59,7 +59,7 @@ impl VisibilityStage {
         let frames = work.frames.div_ceil(self.recipe.frame_stride.get().into());
         let frames = if strided > max_views { frames.min(max_views as u64) } else { frames };
         let rows = StatisticRows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
-        per_gaussian.insert(0, ("rows", rows as u64));
+        per_gaussian.insert(0, ("statistics", rows as u64));
         fixed.push(Workload::view_list_memory(strided.min(max_views)));
         if every > 1.0 {
             // Strides turn a schedule (list of views per frame) into a second one, with an entry for each frame.

@@ -225,7 +225,7 @@ impl RefineStage {
     /// cameras and `between` from new cameras.
     fn estimate_for_views(&self, work: &Workload, limits: &Limits, [own, between]: [usize; 2]) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
-        let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
+        let read = [("readers", work.input.reader), ("kept frames", work.kept_frames_bytes(limits, Attributes::all()))];
         // Target views of one frame are rendered together, each by a renderer that keeps its buffers.
         let together = work.threads.min(limits.views_together as u64);
         let original = [("states", whole), ("views", together * SHARED_VIEW_BYTES_PER_GAUSSIAN)];
@@ -235,7 +235,7 @@ impl RefineStage {
         // the renderer's buffers.
         let is_deformed = work.input.jacobian > 0;
         let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
-        let left_readers = if is_deformed { [("readers", 0), ("held", 0)] } else { read };
+        let left_readers = if is_deformed { [("readers", 0), ("kept frames", 0)] } else { read };
         // Optimization steps use one renderer, and the ranking of a prune step one per thread.
         let view_bytes = (2 * GRADIENT_BYTES_PER_VISIBLE as u64).max(work.threads * SHARED_VIEW_BYTES_PER_GAUSSIAN);
         let left = [
@@ -243,7 +243,10 @@ impl RefineStage {
             ("jacobians", (2 + work.threads.max(2)) * work.input.jacobian),
             ("mean", 2 * work.state_bytes(self.columns)),
             ("neighbors", NEIGHBOR_BYTES),
-            ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
+            (
+                "optimizer",
+                whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64,
+            ),
             ("result", work.input.compressed),
             ("views", view_bytes.max(work.input.prepared)),
         ];
@@ -258,8 +261,8 @@ impl RefineStage {
         let keyframe_bytes = optimizer::bytes_per_gaussian(self.columns, 0) as u64
             + work.state_bytes(self.columns.difference(Attributes::SH))
             + 12;
-        let keyframe_steps =
-            (keyframe_count > 0).then(|| phase(wanted, Some(("course", keyframe_count as u64 * keyframe_bytes))));
+        let keyframe_steps = (keyframe_count > 0)
+            .then(|| phase(wanted, Some(("trajectory delta", keyframe_count as u64 * keyframe_bytes))));
         let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
         let stages = [Some(original), Some(phase(wanted.max(MIN_START_COUNT_FRACTION), None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
@@ -295,7 +298,7 @@ impl RefineStage {
             seconds: 2.0 * work.reading_seconds(work.gaussian_count(), frames as f64)
                 + stored.render_seconds(target_views, work.gaussian_count(), RENDER_COST)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),
-            per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
+            per_gaussian: [scored_memory(limits), vec![("survivors", 24)], per_gaussian].concat(),
             fixed: vec![
                 work.block_buffer_memory(),
                 ("pairs", (GRADIENT_STRIP_BYTES as u64).max(together * STRIP_BYTES as u64)),

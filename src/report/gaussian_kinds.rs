@@ -65,12 +65,12 @@ impl GaussianKind {
 /// Returns the resource estimate (memory, time, reads) of [`kind_flags`].
 pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
     let per_gaussian = vec![
-        ("rows", SCORING_BYTES_PER_GAUSSIAN),
+        ("statistics", SCORING_BYTES_PER_GAUSSIAN),
         ("states", work.state_bytes(Attributes::POSITION | Attributes::LOG_SCALE)),
         ("colors", 88 + work.state_bytes(Attributes::SH | Attributes::OPACITY)),
         ("neighbors", 190),
         ("readers", work.input.reader),
-        ("held", work.kept_frames_bytes(&Limits::NONE, Attributes::SH | Attributes::OPACITY)),
+        ("kept frames", work.kept_frames_bytes(&Limits::NONE, Attributes::SH | Attributes::OPACITY)),
     ];
     let frames = MAX_SAMPLED_FRAMES.min(work.frames as usize) as u64;
     let reads = work.scattered_whole_input_reads(1, &Limits::NONE)

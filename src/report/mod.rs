@@ -152,7 +152,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         let mut needs = measure.resource_estimates(work, limits, MeasuredOnArrival::default());
         needs.push(gaussian_kinds::resource_estimate(work));
         needs.extend(evaluation::resource_estimates(work, limits).into_iter().map(|mut need| {
-            need.per_gaussian.push(("rows", SCORING_BYTES_PER_GAUSSIAN + 8));
+            need.per_gaussian.push(("statistics", SCORING_BYTES_PER_GAUSSIAN + 8));
             need.fixed.push(("films", film::memory_bytes(work)));
             need
         }));

@@ -159,7 +159,7 @@ pub fn render_estimate(
         per_gaussian: vec![
             ("states", models * work.state_bytes(Attributes::all())),
             ("readers", models * work.input.reader),
-            ("held", models * work.kept_frames_bytes(limits, Attributes::all())),
+            ("kept frames", models * work.kept_frames_bytes(limits, Attributes::all())),
             ("views", views_together * SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ],
         fixed: vec![

@@ -202,8 +202,8 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         let mut needs = plan.estimates(work, limits);
         for need in &mut needs {
             need.per_gaussian.push(("settings", HELD_BYTES));
-            need.fixed.extend([("judged", Judge::bytes(work.pixels)), ("counts", SKETCH_BYTES)]);
-            need.fixed.push(("thinned", thinned_schedule_bytes(work, options.max_frames)));
+            need.fixed.extend([("judged renders", Judge::bytes(work.pixels)), ("counts", SKETCH_BYTES)]);
+            need.fixed.push(("chosen views", thinned_schedule_bytes(work, options.max_frames)));
         }
         needs
     })?;

@@ -136,7 +136,7 @@ impl ArchiveStage {
             per_gaussian: vec![
                 ("states", whole),
                 ("readers", work.input.reader),
-                ("held", work.kept_frames_bytes(limits, Attributes::all())),
+                ("kept frames", work.kept_frames_bytes(limits, Attributes::all())),
                 ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
                 ("contents", 4 * whole),
             ],

@@ -108,11 +108,11 @@ impl ShDegreeStage {
         let (whole, reader, held) =
             (work.state_bytes(Attributes::all()), work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let per_gaussian = vec![
-            ("kept", bytes_of_survivors(output_fraction, 24)),
+            ("survivors", bytes_of_survivors(output_fraction, 24)),
             ("states", whole + bytes_of_survivors(output_fraction, 2 * whole)),
             ("result", bytes_of_survivors(output_fraction, work.input.compressed)),
             ("readers", reader + bytes_of_survivors(output_fraction, reader)),
-            ("held", held + bytes_of_survivors(output_fraction, held)),
+            ("kept frames", held + bytes_of_survivors(output_fraction, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let views = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.frame_views) } else { 0 };

@@ -85,7 +85,7 @@ impl Choose {
             ("states", whole + bytes_of_survivors(output_fraction, whole)),
             ("result", bytes_of_survivors(output_fraction, work.input.compressed)),
             ("readers", reader + bytes_of_survivors(merging, reader)),
-            ("held", held + bytes_of_survivors(merging, held)),
+            ("kept frames", held + bytes_of_survivors(merging, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let together = VIEWS_PER_BATCH.min(limits.views_together) as u64;

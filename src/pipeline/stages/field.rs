@@ -79,7 +79,7 @@ impl FieldPrecisionStage {
     pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let per_gaussian = vec![
-            ("kept", bytes_of_survivors(output_fraction, 24)),
+            ("survivors", bytes_of_survivors(output_fraction, 24)),
             ("states", whole + bytes_of_survivors(output_fraction, whole)),
             ("result", bytes_of_survivors(output_fraction, 2 * work.input.compressed)),
             ("readers", work.input.reader + bytes_of_survivors(output_fraction, work.input.reader)),

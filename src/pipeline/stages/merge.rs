@@ -157,12 +157,12 @@ impl MergeStage {
             // The importances C (contribution) and Vis (fraction of views that may show the Gaussian) are read back
             // from disk if they were moved there.
             ("importance", if limits.statistics_on_disk { 16 } else { 0 }),
-            ("pool", BYTES_PER_SURVIVOR as u64),
+            ("candidates", BYTES_PER_SURVIVOR as u64),
             ("proxies", proxies),
             ("survivors", merging::BYTES_PER_SURVIVOR as u64),
-            ("passing", (self.recipe.max_neighbors * merging::BYTES_PER_PASSED_PAIR) as u64),
+            ("passing pairs", (self.recipe.max_neighbors * merging::BYTES_PER_PASSED_PAIR) as u64),
             ("readers", work.input.reader),
-            ("followed", motion_pass::bytes_per_gaussian(limits.max_kept_frames) as u64),
+            ("pair motion", motion_pass::bytes_per_gaussian(limits.max_kept_frames) as u64),
         ];
         // States are read once. Every pass of every trial follows its pairs over all frames twice, because coinciding
         // pairs, if there are any, are merged first.

@@ -111,7 +111,7 @@ impl QualityStage {
         let views = (MOST_VIEWS as u64).min(work.frame_views.max(1));
         let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
         let result = vec![
-            ("kept", bytes_of_survivors(output_fraction, 24)),
+            ("survivors", bytes_of_survivors(output_fraction, 24)),
             ("result", bytes_of_survivors(output_fraction, 2 * work.input.compressed)),
         ];
         ResourceEstimate {

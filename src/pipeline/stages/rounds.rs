@@ -120,7 +120,7 @@ impl Rounds {
         let all = (self.views as u64).min(work.frame_views);
         let groups = (self.groups as u64).min(all).max(1);
         let per_gaussian =
-            [scored_memory(limits), vec![("ranking", 32), ("errors", 8 * groups), ("found", 8 * groups)], looking]
+            [scored_memory(limits), vec![("ranking", 32), ("errors", 8 * groups), ("new errors", 8 * groups)], looking]
                 .concat();
         let seconds = (0..self.rounds(self.usual)).map(|round| {
             let left = work.gaussian_count() * self.fraction.powi(round as i32);

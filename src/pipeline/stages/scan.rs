@@ -61,7 +61,7 @@ impl ScanStage {
                 * frames_read
                 * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
                 + work.reading_seconds(work.gaussian_count(), frames_read),
-            per_gaussian: vec![("rows", 2 * StatisticRows::BYTES_PER_GAUSSIAN as u64)],
+            per_gaussian: vec![("statistics", 2 * StatisticRows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![
                 ("blocks", work.threads * work.largest_block(GAUSSIANS_PER_BLOCK as u64) * block),
                 work.block_buffer_memory(),

@@ -197,7 +197,7 @@ impl WriteStage {
         let is_solved = work.input.compressed > 0;
         let mut per_gaussian = [
             scored_memory(limits),
-            vec![("kept", 40), ("result", bytes_of_survivors(output_fraction, work.input.compressed))],
+            vec![("survivors", 40), ("result", bytes_of_survivors(output_fraction, work.input.compressed))],
         ]
         .concat();
         let within = if self.kind == OutputKind::Archive { bounds::storing_memory(work) } else { Vec::new() };
@@ -209,8 +209,8 @@ impl WriteStage {
                 let waiting = work.kept_frames_bytes(&Limits::NONE, Attributes::all())
                     + FRAME_BLOCK as u64 * work.state_bytes(mixed);
                 let together = (limits.gaussians_together as u64).min(work.gaussians);
-                per_gaussian.push(("members", choose::BYTES_PER_GAUSSIAN));
-                fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
+                per_gaussian.push(("cluster members", choose::BYTES_PER_GAUSSIAN));
+                fixed.push(("proxy states", together * (waiting + 2 * whole + work.input.reader + 24)));
             }
             OutputKind::Gseq => (),
             // Template file and output rows (one per Gaussian or proxy) for each thread; or one state and the data it
@@ -219,11 +219,13 @@ impl WriteStage {
                 // The trajectories of proxies are computed from all members of their clusters.
                 let merging = if is_solved { output_fraction } else { 1.0 };
                 per_gaussian.push(("readers", bytes_of_survivors(merging, work.input.reader)));
-                per_gaussian
-                    .push(("held", bytes_of_survivors(merging, work.kept_frames_bytes(limits, Attributes::all()))));
+                per_gaussian.push((
+                    "kept frames",
+                    bytes_of_survivors(merging, work.kept_frames_bytes(limits, Attributes::all())),
+                ));
                 let rows = bytes_of_survivors(output_fraction, work.threads * (work.input.file + 2 * whole));
                 per_gaussian.push(("files", work.input.file + rows));
-                per_gaussian.push(("members", choose::BYTES_PER_GAUSSIAN));
+                per_gaussian.push(("cluster members", choose::BYTES_PER_GAUSSIAN));
                 per_gaussian.push(("encoded", bytes_of_survivors(output_fraction, self.kind.encoding_bytes(whole))));
             }
         }
