@@ -209,17 +209,17 @@ pub trait Deformation: Sync {
     fn stored(&self) -> &StoredParams;
 
     /// Returns the attributes of the stored parameters that an optimizer can change: the attributes whose derivatives
-    /// [`DeformedGaussians::jacobian`] can compute.
+    /// [`PreparedDeformation::jacobian`] can compute.
     fn movable(&self) -> Attributes;
 
     /// Prepares the evaluation of the Gaussians with the parameters `stored` at several frames. This call does all the
     /// work that does not depend on time.
-    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a>;
+    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn PreparedDeformation + 'a>;
 }
 
 /// [`Deformation`] that is prepared for one set of stored parameters. Computes the states of these Gaussians at any
 /// frame, and their derivatives.
-pub trait DeformedGaussians {
+pub trait PreparedDeformation {
     /// Computes the state of all Gaussians at `frame`. Writes only the attributes `want` to `out`, and resizes these.
     ///
     /// # Errors

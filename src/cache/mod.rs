@@ -190,7 +190,7 @@ impl Cache {
             self.write_shard(stage, key, part, &found)?;
             Ok(found)
         };
-        let count = self.divide(stage, key, &find, &make)?;
+        let count = self.resolve_shard_count(stage, key, &find, &make)?;
         let whole = match count {
             1 => join(&mut std::iter::once_with(|| compute(0..units)))?,
             _ => join(&mut Shard::all(count).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
@@ -229,7 +229,7 @@ impl Cache {
         if let Some(whole) = find(Shard::WHOLE)? {
             return Ok(vec![(0..units, whole)]);
         }
-        let count = self.divide(stage, key, &find, &make)?;
+        let count = self.resolve_shard_count(stage, key, &find, &make)?;
         let spill = |part: Shard| Ok((part.unit_range(units), find(part)?.map_or_else(|| make(part), Ok)?));
         let spills = Shard::all(count).map(spill).collect::<Result<_>>()?;
         self.complete(stage, spills)
@@ -246,21 +246,20 @@ impl Cache {
         }
     }
 
-    /// Returns the number of shards (parts) into which `stage` is divided; 1 means that it is not divided. The caller
-    /// then computes the shards that are not stored, and joins all of them. Call this method only if the full result of
+    /// Returns the number of shards (parts) that the caller must join to get the result of `stage`; 1: the stage is not
+    /// divided. The caller computes the shards that are not stored yet. Call this method only if the full result of
     /// `stage` is not stored.
     ///
-    /// The work folder may hold shards from several runs that divided the stage into different numbers of shards. The
-    /// first case that applies decides:
-    /// - There is no work folder: returns 1.
-    /// - All shards of a division into m shards are stored: returns m.
-    /// - The run is not limited to one shard: returns the number of shards of the division of which the largest
-    ///   fraction is stored, or 1 if no shard is stored.
-    /// - The run is limited to shard 1 of 1: returns 1.
-    /// - The run is limited to one of several shards: the run ends here, as intended, with the error
-    ///   [`Error::ShardDone`], which reports the missing shards. Before that, `make` computes and stores the shard of
-    ///   this run if `find`, which reads a stored shard, does not find it.
-    fn divide<T>(
+    /// The cache may hold shards from runs that divided the stage into different numbers of shards. The first case that
+    /// applies decides:
+    /// - There is no cache folder: returns 1.
+    /// - All m shards of some division are stored: returns m.
+    /// - The run has no option `--shard`: returns the number of shards of the division of which the largest fraction is
+    ///   stored, or 1 if no shard is stored.
+    /// - `--shard 1/1`: returns 1.
+    /// - `--shard i/n` with n > 1: if `find` does not find the stored shard i, `make` computes and stores it. Then the
+    ///   method fails with [`Error::ShardDone`], which ends the run as intended and reports the missing shards.
+    fn resolve_shard_count<T>(
         &self,
         stage: &str,
         key: CacheKey,

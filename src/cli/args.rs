@@ -448,9 +448,8 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// Output. NAME.gsz, .gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd: a file of this
-    /// format. A folder: the model that an archive contains, one PLY per frame of a sequence, or a model in the input's
-    /// own format. `-`: a frame stream on standard output (format/STREAM.md)
+    /// Output. NAME.gsz, .gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd: a file. A folder: the
+    /// model of an archive, a PLY per frame, or a model in the input's format. `-`: a frame stream (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// Path of the output: the same as the argument OUTPUT, in the form that other commands use

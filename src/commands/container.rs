@@ -150,7 +150,7 @@ fn pack_arriving(
     })?;
     let staged = StagedFile::new(output, overwrite)?;
     let mut quota = frame_quota(input, stream.header())?;
-    let received = pack_stream(stream, staged.path(), packing, &input.events, |held| quota.admit(held.len()))?;
+    let received = pack_stream(stream, staged.path(), packing, &input.events, |held| quota.count_arrived(held.len()))?;
     let container = Container::open(staged.path())?;
     let (gaussians, frames) = (container.info().count, container.info().times.len());
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();

@@ -94,7 +94,7 @@ pub fn convert(
         let bytes = write(staged.path())?;
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::new(model, &input.path, model.digest()?)?.with_file_names_only(),
+            "input": InputSummary::new(model, &input.path, model.digest()?)?.without_folder_paths(),
         });
         let path = staged.path().join(SUMMARY_FILE);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;

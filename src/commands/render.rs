@@ -15,7 +15,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::model::{Camera, FrameView};
 use crate::outputs::kind::check_folder_name;
-use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::summary::{CameraSummary, InputSummary};
 use crate::progress::Events;
 use crate::render::Image;
@@ -138,7 +138,7 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
         };
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::new(&*scene.input, &scene.path, scene.digest()?)?.with_file_names_only(),
+            "input": InputSummary::new(&*scene.input, &scene.path, scene.digest()?)?.without_folder_paths(),
             "cameras": CameraSummary {
                 origin: scene.rig.origin.clone(),
                 cameras: scene.rig.cameras.len(),
@@ -212,7 +212,7 @@ impl RenderJob<'_> {
             BatchLimits::one_frame(&self.limits),
             |batch| {
                 // Renders are parallel inside too, because a frame can have fewer views than there are threads.
-                let made = batch.par_iter().map(|view: &ViewStates<'_, 1>| {
+                let made = batch.par_iter().map(|view: &RenderableView<'_, 1>| {
                     let made = render_one(view.frame_view, &view.render(0, self.background))?;
                     progress.advance(1);
                     Ok(made)

@@ -13,7 +13,7 @@ use crate::limits::Limits;
 use crate::memory_plan::ResourceEstimate;
 use crate::model::{Camera, FrameView, Rig, RigView};
 use crate::outputs::film::{FilmFormat, FilmOutput};
-use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::camera_path::cameras_along;
@@ -235,7 +235,7 @@ impl FilmSource<'_> {
         for_each_view_batch(subjects, self.cameras, self.views, BatchLimits::one_frame(self.limits), |views| {
             let images: Vec<Image> = views
                 .par_iter()
-                .map(|view: &ViewStates<'_, S>| {
+                .map(|view: &RenderableView<'_, S>| {
                     let renders = (0..S).into_par_iter().map(|subject| view.render(subject, self.background));
                     side_by_side(renders.collect())
                 })

@@ -19,7 +19,7 @@ use crate::model::{Camera, FrameView, Rig, Split};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::outputs::kind::{OutputKind, check_folder_name};
-use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
 use crate::player::view::{ViewOptions, view};
 use crate::progress::Events;
@@ -248,7 +248,7 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
         RenderedSource::all_gaussians(&refined),
     ];
     for_each_view_batch(subjects, &[camera], &views, BatchLimits::one_frame(limits), |batch| {
-        let render = |view: &ViewStates<'_, 3>| {
+        let render = |view: &RenderableView<'_, 3>| {
             let black = rig.background.unwrap_or_default();
             beside([0, 1, 2].map(|subject| view.render(subject, black)))
         };

@@ -40,7 +40,7 @@ use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, FrameView, Gaussians};
 use crate::models::InputModel;
-use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
@@ -289,7 +289,7 @@ impl ModelPair {
             let progress = self.scene.events.task(name, "views", range.len() as u64);
             let mut all = Vec::with_capacity(range.len());
             self.for_each_batch(&self.views[range], |views| {
-                let observe_view = |view: &ViewStates<'_, 2>| {
+                let observe_view = |view: &RenderableView<'_, 2>| {
                     let seen = observe(view.states[0], view.camera, &self.render_view(view)?);
                     progress.advance(1);
                     Ok(seen)
@@ -382,7 +382,7 @@ impl ModelPair {
             return Ok(CacheKey::NONE);
         }
         let compressed = self.scene.input_digest(&self.compressed_as, &*self.compressed)?;
-        let photographs = self.truth.as_ref().map(|truth| truth.file_stamps(&self.views)).transpose()?;
+        let photographs = self.truth.as_ref().map(|truth| truth.file_fingerprints(&self.views)).transpose()?;
         Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
@@ -432,7 +432,7 @@ impl ModelPair {
     ) -> Result<Vec<O>> {
         let mut found = Vec::with_capacity(views.len());
         self.for_each_batch(views, |batch| {
-            let compare_view = |view: &ViewStates<'_, 2>| {
+            let compare_view = |view: &RenderableView<'_, 2>| {
                 let images = [0, 1].map(|subject| view.render(subject, self.background));
                 see([&images[0], &images[1]])
             };
@@ -458,7 +458,11 @@ impl ModelPair {
 
     /// Calls `visit` for all `views`, in order, with a batch of views at a time. For each view of a batch, `visit` gets
     /// the frame states of the original and of the compressed model.
-    fn for_each_batch(&self, views: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
+    fn for_each_batch(
+        &self,
+        views: &[FrameView],
+        visit: impl FnMut(&[RenderableView<'_, 2>]) -> Result<()>,
+    ) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all_gaussians);
         for_each_view_batch(subjects, &self.scene.rig.cameras, views, BatchLimits::one_frame(&self.scene.limits), visit)
     }
@@ -519,8 +523,8 @@ impl ModelPair {
     }
 
     /// Renders a view with both models, and reads its photograph if there is one. Returns these images.
-    fn render_view(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
-        let &ViewStates { frame_view, camera, .. } = view;
+    fn render_view(&self, view: &RenderableView<'_, 2>) -> Result<RenderedViews> {
+        let &RenderableView { frame_view, camera, .. } = view;
         Ok(RenderedViews {
             original: view.render(0, self.background),
             compressed: view.render(1, self.background),

@@ -54,7 +54,7 @@ pub struct PrecisionDiagram {
 /// Cause of the errors that the command `precision` measures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum ErrorSource {
+pub enum InaccuracySource {
     /// Error of sampling, such as leaving out views or using a finite step size.
     Discretization,
     /// Error of rounding to a finite number of digits.
@@ -63,31 +63,31 @@ pub enum ErrorSource {
     Model,
 }
 
-impl ErrorSource {
+impl InaccuracySource {
     /// Returns the name of this error source in tables and CSV files.
     pub fn name(self) -> &'static str {
         match self {
-            ErrorSource::Discretization => "discretization",
-            ErrorSource::Rounding => "rounding",
-            ErrorSource::Model => "model",
+            InaccuracySource::Discretization => "discretization",
+            InaccuracySource::Rounding => "rounding",
+            InaccuracySource::Model => "model",
         }
     }
 }
 
-/// Results of one knob: a parameter, or a group of parameters, that trades run time for error.
+/// Results for one group of parameters (in the option `--knobs`: a knob) that trade run time for error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionKnob {
-    /// Name of the knob, as in the option `--knobs`.
+    /// Name of the group, as in the option `--knobs`.
     pub name: String,
-    /// Description of the knob and its errors, for the user.
+    /// Description of the parameters and their errors, for the user.
     pub about: String,
-    /// Source of the errors that the knob changes.
-    pub source: ErrorSource,
-    /// Measurements of each parameter of the knob.
+    /// Source of the errors that these parameters change: sampling, rounding or the smaller model.
+    pub source: InaccuracySource,
+    /// Measurements of each parameter of the group.
     pub curves: Vec<PrecisionCurve>,
 }
 
-/// Measurements of one parameter of a knob at several values.
+/// Measurements of one parameter at several values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionCurve {
     /// Name of the parameter; the name in the recipe if it is a recipe parameter.
@@ -418,7 +418,7 @@ mod tests {
         let knob = PrecisionKnob {
             name: "percentiles".to_owned(),
             about: String::new(),
-            source: ErrorSource::Discretization,
+            source: InaccuracySource::Discretization,
             curves: vec![curve],
         };
         let found = PrecisionDiagram {

@@ -251,7 +251,7 @@ impl InsideOutsideMeans {
 
 impl Evaluation {
     /// Returns the evaluation with every path reduced to its last component, for writing to a file.
-    pub fn with_file_names_only(mut self) -> Evaluation {
+    pub fn without_folder_paths(mut self) -> Evaluation {
         let truth = self.ground_truth.as_mut().map(|truth| &mut truth.folder);
         for path in [&mut self.path.original, &mut self.path.compressed].into_iter().chain(truth) {
             *path = name_of(Path::new(path));

@@ -2,7 +2,7 @@
 //! or repaired.
 
 /// Maximum number of row indices in a note to the user about one kind of defect.
-pub const LISTED_ROWS: usize = 5;
+pub const MAX_LISTED_ROWS: usize = 5;
 /// How an infinite opacity logit is repaired, for notes to the user.
 pub const INFINITE_LOGIT_REPAIR: &str = "read as ±100, which is opaque or invisible";
 /// Fraction of dropped rows that determines where the note with the total counts stands among the notes to the user:
@@ -56,7 +56,7 @@ impl Defects {
             });
             let kind = &mut self.kinds[place];
             kind.rows += 1;
-            if kind.first.len() < LISTED_ROWS {
+            if kind.first.len() < MAX_LISTED_ROWS {
                 kind.first.push(row);
             }
         }
@@ -105,7 +105,7 @@ impl Defects {
 /// more. `count` is the number of all indices; `first` holds at least the first five of them, or all if there are
 /// fewer.
 pub fn first_of(first: &[u32], count: usize) -> String {
-    let listed: Vec<String> = first.iter().take(LISTED_ROWS).map(u32::to_string).collect();
+    let listed: Vec<String> = first.iter().take(MAX_LISTED_ROWS).map(u32::to_string).collect();
     listed.join(", ") + if count > listed.len() { ", ..." } else { "" }
 }
 

@@ -101,7 +101,7 @@ pub struct FtgsHeader {
 /// Content of a `.ftgs.ply` file: the parameters of its Gaussians, and counts of the Gaussians that were repaired or
 /// left out.
 #[derive(Debug)]
-pub struct Ftgs {
+pub struct FtgsFile {
     /// Settings that the header of the file states.
     pub header: FtgsHeader,
     /// Parameters of the Gaussians that were read.
@@ -173,14 +173,14 @@ impl FtgsHeader {
     }
 }
 
-impl Ftgs {
+impl FtgsFile {
     /// Reads the Gaussians of the file at `path`. Leaves out Gaussians with a value that is not finite. `zero_rotation`
     /// determines whether Gaussians with a zero quaternion are left out or get the identity as rotation.
     ///
     /// # Errors
     /// Fails if the file is not a PLY of Gaussians, lacks a property, has another version or unit of time, or if all
     /// Gaussians would be left out.
-    pub fn open(path: &Path, options: &PlyOptions, zero_rotation: ZeroRotation) -> Result<Ftgs> {
+    pub fn open(path: &Path, options: &PlyOptions, zero_rotation: ZeroRotation) -> Result<FtgsFile> {
         let ply = Ply::open_with(path, options)?;
         let header = FtgsHeader::parse(path, ply.comments(), ply.sh_degree())?;
         let own_bytes = 4 * PARAMS_PER_GAUSSIAN as u64 * ply.count() as u64;
@@ -210,7 +210,7 @@ impl Ftgs {
                 params.gaussians.rotation.set_row(row, [1.0, 0.0, 0.0, 0.0]);
             }
         }
-        Ok(Ftgs { header, params, defects })
+        Ok(FtgsFile { header, params, defects })
     }
 }
 
@@ -313,8 +313,8 @@ mod tests {
         made
     }
 
-    fn read(path: &Path) -> Result<Ftgs> {
-        Ftgs::open(path, &PlyOptions::default(), ZeroRotation::Drop)
+    fn read(path: &Path) -> Result<FtgsFile> {
+        FtgsFile::open(path, &PlyOptions::default(), ZeroRotation::Drop)
     }
 
     #[test]
@@ -350,7 +350,7 @@ mod tests {
     }
 
     /// Writes a file of Gaussians, replaces the text `from` in it by `to`, and reads the file.
-    fn read_changed(from: &str, to: &str) -> Result<Ftgs> {
+    fn read_changed(from: &str, to: &str) -> Result<FtgsFile> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ftgs.ply");
         write_ftgs(&params(4, 0), &ClipTimes { frames: Some(9), ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
@@ -402,7 +402,7 @@ mod tests {
             notes.contains("2 of 6 rows") && notes.contains("rows 1, 2") && notes.contains("--zero-rotation"),
             "{notes}"
         );
-        let kept = Ftgs::open(&path, &PlyOptions::default(), ZeroRotation::Identity).unwrap();
+        let kept = FtgsFile::open(&path, &PlyOptions::default(), ZeroRotation::Identity).unwrap();
         assert_eq!((kept.params.len(), kept.params.gaussians.rotation.row(2)), (4, [1.0, 0.0, 0.0, 0.0]));
         odd.format_specific.plane_mut(TIME_CENTER).fill(f32::NAN);
         write_ftgs(&odd, &ClipTimes::UNIT_INTERVAL, &path).unwrap();

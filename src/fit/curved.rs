@@ -72,7 +72,7 @@ impl CurveForm {
 
     /// Returns the form with linear motion, constant rotation, and time windows of at least `min_width` units of time.
     /// A [`CubicTrack`] of this form has quadratic and cubic coefficients of 0.
-    pub fn linear(min_width: f64) -> CurveForm {
+    pub fn linear_with_min_width(min_width: f64) -> CurveForm {
         CurveForm { has_linear_motion: true, min_width, max_intervals: 32 }
     }
 
@@ -525,7 +525,7 @@ mod tests {
         let tolerance = Tolerance::default();
         for opacity in [0.1, 0.4, 0.5, 0.6, 0.8] {
             let wave = track(120, |t| [0.3 * (18.0 * t).sin(), 0.0, 0.0], |_| opacity);
-            for form in [CurveForm::CUBIC, CurveForm::linear(0.02)] {
+            for form in [CurveForm::CUBIC, CurveForm::linear_with_min_width(0.02)] {
                 let found = fit_curves(&wave, form, &tolerance, &mut FitError::default());
                 let mut patient = TrackFit::new(&wave, form, &tolerance);
                 patient.seeks_best = true;
@@ -544,7 +544,7 @@ mod tests {
 
     #[test]
     fn invisible_track_has_no_curve_and_single_frame_has_one() {
-        for form in [CurveForm::CUBIC, CurveForm::linear(0.02)] {
+        for form in [CurveForm::CUBIC, CurveForm::linear_with_min_width(0.02)] {
             let fit = |track: FittedTrack| fit_curves(&track, form, &Tolerance::default(), &mut FitError::default());
             assert!(fit(track(20, |_| [0.0; 3], |_| 1e-3)).is_empty());
             let still = fit(track(1, |_| [1.0; 3], |_| 0.5));
@@ -558,7 +558,7 @@ mod tests {
         let mut misfit = FitError::default();
         let cut = track(40, |t| [2.0 * t, 1.0 - t, 0.0], |t| 0.8 * window(t, -0.1, 0.6));
         let cut = FittedTrack { rotation: vec![[1.0, 0.0, 0.0, 0.0]; 40], ..cut };
-        let one = fit_curves(&cut, CurveForm::linear(0.0), &Tolerance::default(), &mut misfit);
+        let one = fit_curves(&cut, CurveForm::linear_with_min_width(0.0), &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].center + 0.1).abs() < 1e-6 && (one[0].width - 0.6).abs() < 1e-6, "{:?}", one[0]);
         assert!((one[0].opacity - 0.8).abs() < 1e-6 && (one[0].position[1][0] - 2.0).abs() < 1e-2, "{:?}", one[0]);
@@ -569,7 +569,7 @@ mod tests {
     fn lines_have_no_higher_terms_and_no_narrow_window() {
         let mut misfit = FitError::default();
         let turning = track(60, |t| [(3.0 * t).sin(), (3.0 * t).cos(), 0.0], |t| 0.6 + 0.2 * (9.0 * t).sin());
-        let lines = fit_curves(&turning, CurveForm::linear(0.1), &Tolerance::default(), &mut misfit);
+        let lines = fit_curves(&turning, CurveForm::linear_with_min_width(0.1), &Tolerance::default(), &mut misfit);
         assert!((2..=9).contains(&lines.len()), "{} lines", lines.len());
         for line in &lines {
             assert_eq!((&line.position[2..], line.rotation[1]), (&[[0.0; 3]; 2][..], [0.0; 4]));

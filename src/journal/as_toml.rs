@@ -29,7 +29,7 @@ mod tests {
 
     use super::*;
     use crate::journal::Journal;
-    use crate::journal::records::{FieldSummary, RefinedSummary, SavedCost, ShDegreeSummary};
+    use crate::journal::records::{FieldPrecisionSummary, RefinedSummary, SavedCost, ShDegreeSummary};
     use crate::pipeline::summary::{ArchiveSummary, GoalSummary};
 
     fn kept<T: Serialize + DeserializeOwned>(value: T) -> T {
@@ -63,7 +63,8 @@ mod tests {
             journal.leave_out_with_saving("c", "d", SavedCost::Stage { seconds: odd, reads: 2.0 });
             journal.leave_out_with_saving("e", "f", SavedCost::Values { bytes: 1 << 50 });
             journal.notes.push("several\nlines, 40.1 dB".to_owned());
-            journal.field = Some(FieldSummary { half: true, views: 3, rounding: odd, result: Some(odd), least: odd });
+            journal.field =
+                Some(FieldPrecisionSummary { half: true, views: 3, rounding: odd, result: Some(odd), least: odd });
             journal.bands = Some(ShDegreeSummary { sh_degree: 2, views: 3, tried, result: odd, least: odd });
             journal.refined = Some(RefinedSummary { views: 3, before: odd, result: odd });
             let shown = format!("{journal:?}");

@@ -15,7 +15,7 @@ use crate::error::Result;
 use crate::journal::as_toml::AsToml;
 use crate::journal::records::Forecast;
 use crate::journal::records::{
-    FieldSummary, OmittedWork, PhotographSummary, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord,
+    FieldPrecisionSummary, OmittedWork, PhotographSummary, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord,
 };
 use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
@@ -68,7 +68,7 @@ pub struct Journal {
     /// Notes for the user.
     pub notes: Vec<String>,
     /// Measured effect on renders of writing the deformation field in half precision, if it was measured.
-    pub field: Option<FieldSummary>,
+    pub field: Option<FieldPrecisionSummary>,
     /// Measured effect on renders of dropping SH degrees, if it was measured.
     pub bands: Option<ShDegreeSummary>,
     /// PSNR before and after refinement, if the run refined.

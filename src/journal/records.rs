@@ -100,7 +100,7 @@ pub(crate) fn number<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<
 
 /// Effect on renders of writing the deformation field of the result in half precision (2 bytes per value).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct FieldSummary {
+pub struct FieldPrecisionSummary {
     /// Whether the deformation field is written in half precision.
     pub half: bool,
     /// Number of views on which renders were compared.
@@ -117,11 +117,11 @@ pub struct FieldSummary {
     pub least: f64,
 }
 
-impl FieldSummary {
+impl FieldPrecisionSummary {
     /// Returns a text with the measured values that explain why the deformation field is or is not written in half
     /// precision.
     pub(crate) fn why(&self) -> String {
-        let FieldSummary { views, rounding, result, least, .. } = self;
+        let FieldPrecisionSummary { views, rounding, result, least, .. } = self;
         let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
         let result = result.map_or(String::new(), |psnr| {
             format!(", {}", against(psnr, "of the result with the exact field against the original"))

@@ -100,7 +100,7 @@ fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
         let first = k * pairs / pairs.min(MAX_MEASURED_PAIRS);
         let state = |frame: usize| -> Result<Gaussians> {
             let mut state = Gaussians::zeros(0, frames.sh_degree());
-            frames.frame(frame)?.gaussians(
+            frames.frame(frame)?.gather_range(
                 0..frames.gaussian_counts()[frame] as usize,
                 Attributes::all(),
                 &mut state,

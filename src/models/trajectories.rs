@@ -18,7 +18,7 @@ use crate::limits::Limits;
 use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
-use crate::outputs::curves::write_curves;
+use crate::outputs::curves::write_fitted_splatv;
 use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::gsd::write_gsd;
 use crate::outputs::kind::OutputKind;
@@ -170,7 +170,7 @@ pub fn write_sequence(
 ) -> Result<Vec<String>> {
     let info = source.info();
     match kind {
-        OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
+        OutputKind::Splatv => return Ok(vec![write_fitted_splatv(source, path, events)?]),
         OutputKind::Ftgs | OutputKind::Tsog => return write_fitted_windows(source, kind, path, events),
         OutputKind::Gsd => return Ok(vec![write_gsd(source, path, held, events)?]),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),

@@ -20,7 +20,7 @@ use crate::source::FrameSource;
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
-pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
+pub fn write_fitted_splatv(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let times = scale_to_unit(&info.times);
@@ -98,7 +98,7 @@ mod tests {
         let scene = DemoScene::new(300, 30);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.splatv");
-        let message = write_curves(&scene, &path, &Events::IGNORED).unwrap();
+        let message = write_fitted_splatv(&scene, &path, &Events::IGNORED).unwrap();
         assert!(message.starts_with("300 Gaussians became"), "{message}");
         let file = Splatv::open(&path).unwrap();
         let rows: Vec<SplatvGaussian> = (0..file.count()).map(|k| SplatvGaussian::from_words(&file.words(k))).collect();
@@ -134,7 +134,7 @@ mod tests {
             too_faint
         );
         let again = folder.path().join("again.splatv");
-        write_curves(&scene, &again, &Events::IGNORED).unwrap();
+        write_fitted_splatv(&scene, &again, &Events::IGNORED).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap());
     }
 }

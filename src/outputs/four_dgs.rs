@@ -156,9 +156,9 @@ mod tests {
     use crate::model::{Attributes, opacity};
     use crate::passes::gather_all;
 
-    /// Returns 256 Gaussians that do not move, with every 8-bit color, and with the three scales `scale(k)` of
-    /// Gaussian k.
-    fn still_set(scale: impl Fn(usize) -> f32) -> GaussianSet {
+    /// Returns 256 Gaussians without motion. Gaussian k has the 8-bit red value k, and all its three scales are
+    /// `scale(k)`.
+    fn motionless_gaussians(scale: impl Fn(usize) -> f32) -> GaussianSet {
         let byte = |k: usize| k as f32 / 255.0;
         GaussianSet {
             positions: (0..256).flat_map(|k| [k as f32, 0.0, 0.0]).collect(),
@@ -178,7 +178,7 @@ mod tests {
     fn scales_midway_between_grid_points_are_written() {
         let options = WriteOptions::default();
         let log_step = Steps::of(&Bounds::for_profile(options.profile, 1.0)).scale_log;
-        let mut set = still_set(|k| ((k as f64 - 200.5) * log_step).exp() as f32);
+        let mut set = motionless_gaussians(|k| ((k as f64 - 200.5) * log_step).exp() as f32);
         let exact = set.scales.clone();
         snap_to_grid(&mut set, &options);
         write_to_vec(&set, 1.0, &options, &SceneExtras::default()).unwrap();
@@ -189,7 +189,7 @@ mod tests {
 
     #[test]
     fn colors_of_eight_bits_are_written() {
-        let mut set = still_set(|_| 0.1);
+        let mut set = motionless_gaussians(|_| 0.1);
         let (exact, options) = (set.colors.clone(), WriteOptions::default());
         snap_to_grid(&mut set, &options);
         write_to_vec(&set, 1.0, &options, &SceneExtras::default()).unwrap();

@@ -176,8 +176,10 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
     let clip = ClipTimes::from_times(&info.times);
     let times: Vec<f64> = info.times.iter().map(|&time| clip.to_unit(time)).collect();
     let (tolerance, form) = match kind {
-        OutputKind::Tsog => (Tolerance::COMPACT, CurveForm::linear(0.0).with_intervals(COMPACT_INTERVALS)),
-        _ => (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * MIN_TIME_DEVIATION)),
+        OutputKind::Tsog => {
+            (Tolerance::COMPACT, CurveForm::linear_with_min_width(0.0).with_intervals(COMPACT_INTERVALS))
+        }
+        _ => (Tolerance::default(), CurveForm::linear_with_min_width(std::f64::consts::SQRT_2 * MIN_TIME_DEVIATION)),
     };
     let found = map_tracks(source, &times, &progress, |track| {
         let mut misfit = FitError::default();
@@ -230,7 +232,7 @@ fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
 mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::DemoScene;
-    use crate::files::ftgs::Ftgs;
+    use crate::files::ftgs::FtgsFile;
     use crate::files::ply::PlyOptions;
     use crate::files::splatv::rows::ZeroRotation;
     use crate::files::tsog::read::read_tsog;
@@ -240,7 +242,7 @@ mod tests {
 
     /// Returns the position and the opacity of every Gaussian of `file` at the time `time`, by the formulas of the
     /// player.
-    fn shown(file: &Ftgs, time: f64) -> Vec<([f64; 3], f64)> {
+    fn shown(file: &FtgsFile, time: f64) -> Vec<([f64; 3], f64)> {
         let params = &file.params;
         let own = |plane: usize, row: usize| f64::from(params.format_specific.plane(plane)[row]);
         let state = |row: usize| {
@@ -261,7 +263,7 @@ mod tests {
         let path = folder.path().join("scene.ftgs.ply");
         let notes = write_fitted_windows(&scene, OutputKind::Ftgs, &path, &Events::IGNORED).unwrap();
         assert!(notes.len() == 1 && notes[0].starts_with("300 Gaussians became"), "{notes:?}");
-        let file = Ftgs::open(&path, &PlyOptions::default(), ZeroRotation::Drop).unwrap();
+        let file = FtgsFile::open(&path, &PlyOptions::default(), ZeroRotation::Drop).unwrap();
         assert_eq!(file.header.clip.frames, Some(30));
         let (mut missing, mut too_faint, mut seen) = (0, 0, 0);
         for frame in 0..30 {

@@ -17,13 +17,13 @@ pub use gather::{BlockwiseReader, gather, gather_all};
 pub use held::FramesInMemory;
 pub use parts::BlockSlices;
 pub use sample::{
-    VIEWS_PER_FRAME, ViewSampler, frames_to_cover, pixel_stride, scoring_views, select_evenly,
+    VIEWS_PER_FRAME, ViewSampler, frames_needed_to_see_all, pixel_stride, scoring_views, select_evenly,
     select_evenly_over_frames,
 };
 pub use some_frames::SomeFrames;
 pub use states::FrameStates;
 pub use tracks::{TRACKS_PER_BLOCK, map_tracks};
-pub use views::{BatchLimits, RenderedSource, VIEWS_PER_THREAD, ViewStates, for_each_view_batch};
+pub use views::{BatchLimits, RenderableView, RenderedSource, VIEWS_PER_THREAD, for_each_view_batch};
 
 /// Number of Gaussians per unit of parallel work: their attributes at one frame and the sums computed from them fit
 /// into the processor's caches. No result depends on this number.

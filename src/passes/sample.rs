@@ -82,10 +82,10 @@ pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames:
     select_evenly_over_frames(&left, scan.scoring_views, frames)
 }
 
-/// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians are alive (opacity ≥
-/// alpha_min) in one of them. Gaussians that are never alive are ignored; the others are assumed to be alive without a
-/// gap. `life` holds for each Gaussian the number of frames in which it is alive, out of `frames` frames.
-pub fn frames_to_cover(life: &[u32], frames: usize) -> usize {
+/// Returns the minimum number of evenly spaced frames such that at least 99% of the Gaussians are alive (opacity ≥
+/// alpha_min) in one of them or more. Gaussians that are never alive are ignored; the others are assumed to be alive
+/// without a gap. `life` holds for each Gaussian the number of frames in which it is alive, out of `frames` frames.
+pub fn frames_needed_to_see_all(life: &[u32], frames: usize) -> usize {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&life| life > 0).collect();
     if lives.is_empty() {
         return 0;
@@ -200,7 +200,11 @@ mod tests {
         // 12. One more is never alive.
         let life: Vec<u32> = [0, 1, 5, 5].into_iter().chain((0..297).map(|k| 12 + k)).collect();
         assert_eq!(
-            (frames_to_cover(&life, 300), frames_to_cover(&[0, 0], 300), frames_to_cover(&[300], 300)),
+            (
+                frames_needed_to_see_all(&life, 300),
+                frames_needed_to_see_all(&[0, 0], 300),
+                frames_needed_to_see_all(&[300], 300)
+            ),
             (25, 0, 1)
         );
         let frame_count =

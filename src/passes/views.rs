@@ -95,7 +95,7 @@ impl BatchLimits {
 
 /// View to render, with the Gaussians of `S` sources (the subjects) at the view's frame.
 #[derive(Clone, Copy)]
-pub struct ViewStates<'a, const S: usize> {
+pub struct RenderableView<'a, const S: usize> {
     /// The view: its frame, view number and camera index.
     pub frame_view: FrameView,
     /// Camera of the view.
@@ -107,7 +107,7 @@ pub struct ViewStates<'a, const S: usize> {
     decoded: [Option<(&'a dyn FeatureDecoder, &'a AttributeValues)>; S],
 }
 
-impl<const S: usize> ViewStates<'_, S> {
+impl<const S: usize> RenderableView<'_, S> {
     /// Renders the subject (source) with index `subject` over `background` on all threads of the pool, and returns the
     /// image.
     ///
@@ -179,7 +179,7 @@ pub fn for_each_view_batch<const S: usize>(
     cameras: &[Camera],
     views: &[FrameView],
     max_batch: BatchLimits,
-    mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
+    mut visit: impl FnMut(&[RenderableView<'_, S>]) -> Result<()>,
 ) -> Result<()> {
     let wanted = ReadPlan::new(views.iter().map(|view| view.frame)).with_max_kept_frames(max_batch.held);
     let mut readers = Vec::with_capacity(S);
@@ -218,10 +218,10 @@ pub fn for_each_view_batch<const S: usize>(
             slot.frame = frame;
         }
         let frames = batch.chunk_by(|a, b| a.frame == b.frame).zip(&slots);
-        let view_states: Vec<ViewStates<'_, S>> = frames
+        let view_states: Vec<RenderableView<'_, S>> = frames
             .flat_map(|(frame_views, StateSlot { states, features, .. })| {
                 let decoded = std::array::from_fn(|k| Some((subjects[k].decoder()?, &features[k])));
-                frame_views.iter().map(move |&frame_view| ViewStates {
+                frame_views.iter().map(move |&frame_view| RenderableView {
                     frame_view,
                     camera: &cameras[frame_view.camera as usize],
                     states: states.each_ref(),
@@ -273,7 +273,7 @@ impl<W: Send> Workers<W> {
             (0..workers.min(batch.len())).into_par_iter().with_max_len(1).for_each(|_| {
                 let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
                 let mut worker = free.unwrap_or_else(&new_worker);
-                while let Some(&ViewStates { camera, states: [state], .. }) =
+                while let Some(&RenderableView { camera, states: [state], .. }) =
                     batch.get(next.fetch_add(1, Ordering::Relaxed))
                 {
                     visit(&mut worker, state, camera);
@@ -323,7 +323,7 @@ mod tests {
                     assert!(views.len() <= max_batch.max(1), "{} views of at most {max_batch}", views.len());
                     let of_frames = views.chunk_by(|a, b| a.frame_view.frame == b.frame_view.frame).count();
                     assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
-                    for ViewStates { frame_view, camera, states: [state, places], .. } in views {
+                    for RenderableView { frame_view, camera, states: [state, places], .. } in views {
                         assert!(**state == expected[frame_view.frame], "frame {}", frame_view.frame);
                         assert!(places.position == state.position && places.sh.is_empty());
                         assert!(std::ptr::eq(*camera, &rig.cameras[frame_view.camera as usize]));

@@ -107,7 +107,7 @@ pub fn shardable_stages(request: &Request) -> Result<Vec<String>> {
     let memory = Budget { tell: Verbosity::Nothing, ..request.input.memory };
     let input = InputOptions { work: None, memory, ..request.input.clone() };
     let (scene, plan, _) = open_to_measure(&input, plan, &mut Journal::default())?;
-    Ok(plan.shardable_units(&scene))
+    Ok(plan.describe_shardable_work(&scene))
 }
 
 /// Plans the memory of the run of `request`: sets how many frames, views and pairs of Gaussians its stages may keep in
@@ -145,7 +145,7 @@ fn run_stages(
     let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default());
     let _numbered =
         scene.events.begin_run(&stage_seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
-    let input = InputSummary::from_scene(scene)?.with_file_names_only();
+    let input = InputSummary::from_scene(scene)?.without_folder_paths();
     let recipe = recipe_text(&input.digest, plan, request, &mut journal);
     let sh_degree = match request.recipe.bands.bands {
         ShDegreeRule::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),

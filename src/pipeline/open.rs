@@ -168,7 +168,7 @@ fn receive_measured(
     }
     let mut measuring: Option<Measuring<'_>> = None;
     let streamed = ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| {
-        quota.admit(held.len())?;
+        quota.count_arrived(held.len())?;
         if quota.arrived() > to_measure {
             measuring = None;
             return Ok(());

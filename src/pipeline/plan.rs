@@ -247,8 +247,8 @@ impl RunPlan {
     /// Returns one line of text for each divisible stage (a stage whose work several processes can share). A line holds
     /// the name under which the stage caches its results, and its number of units of work, such as blocks of Gaussians
     /// or views.
-    pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
-        self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
+    pub fn describe_shardable_work(&self, scene: &Scene) -> Vec<String> {
+        self.stages.all().flat_map(|stage| stage.describe_shardable_work(scene, &self.stages.counts)).collect()
     }
 
     /// Returns a line of text for display that states how many Gaussians ranking and refinement leave.

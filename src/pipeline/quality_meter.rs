@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use crate::error::{Error, Result};
 use crate::metrics::{decibels, psnr};
 use crate::model::{Camera, FrameView};
-use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::refinement::targets::{Targets, mean_square};
 use crate::render::render;
 use crate::scene::Scene;
@@ -77,7 +77,7 @@ impl<'a> QualityMeter<'a> {
             BatchLimits::one_frame(&self.scene.limits),
             |batch| {
                 let first = found.len();
-                let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
+                let view_psnr = |(place, view): (usize, &RenderableView<'_, 1>)| {
                     match &self.comparison {
                         QualityReference::Photographs(photographs) => {
                             let image = view.render(0, background);

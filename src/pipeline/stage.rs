@@ -86,7 +86,7 @@ pub trait Stage: Debug + Send + Sync {
     /// Returns the work of the stage that several processes can divide among themselves, as lines of text: one line per
     /// kind of unit, such as "NAME: 12 blocks of Gaussians". `_counts` is the plan of how many Gaussians ranking and
     /// refinement leave.
-    fn shardable_units(&self, _scene: &Scene, _counts: &CountPlan) -> Vec<String> {
+    fn describe_shardable_work(&self, _scene: &Scene, _counts: &CountPlan) -> Vec<String> {
         Vec::new()
     }
 

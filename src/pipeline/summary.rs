@@ -14,7 +14,7 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::names::name_of;
 use crate::journal::records::{
-    FieldSummary, Forecast, OmittedWork, PhotographSummary, QualitySummary, RefinedSummary, ShDegreeSummary,
+    FieldPrecisionSummary, Forecast, OmittedWork, PhotographSummary, QualitySummary, RefinedSummary, ShDegreeSummary,
     StageRecord, TermSummary, UnusualValueCounts, number, sizes,
 };
 use crate::merging::PassCounts;
@@ -134,7 +134,7 @@ impl InputSummary {
 impl InputSummary {
     /// Returns this description of the input with its path reduced to the last component, for a file that may be
     /// published.
-    pub fn with_file_names_only(self) -> InputSummary {
+    pub fn without_folder_paths(self) -> InputSummary {
         InputSummary { path: name_of(Path::new(&self.path)), ..self }
     }
 }
@@ -241,7 +241,7 @@ pub struct Summary {
     /// Result of the search for the smallest model with a requested quality, if a quality was requested.
     pub goal: Option<GoalSummary>,
     /// Measured effect of writing the deformation field in half precision; `None` if it was not requested.
-    pub field: Option<FieldSummary>,
+    pub field: Option<FieldPrecisionSummary>,
     /// Measured effect of dropping SH degrees; `None` if it was not requested or is impossible.
     pub bands: Option<ShDegreeSummary>,
     /// PSNR before and after refinement; `None` if nothing was refined.

@@ -47,7 +47,7 @@ const SHADERS: [(&str, &str); 5] = [
 
 /// Description of one model on the player page.
 #[derive(Debug, Serialize)]
-pub struct PageModel {
+pub struct PageModelInfo {
     /// Role of the model: `original` or `compressed`.
     pub role: &'static str,
     /// Name of the model's file or folder.
@@ -68,7 +68,7 @@ pub struct PageScene {
     /// Name and version of the program that wrote the page.
     pub tool: &'static str,
     /// One model, or the original and the compressed model.
-    pub models: Vec<PageModel>,
+    pub models: Vec<PageModelInfo>,
     /// Cameras of the scene.
     pub cameras: Vec<PageCamera>,
     /// Background color: red, green, blue in [0, 1].
@@ -319,7 +319,14 @@ mod tests {
         };
         PageScene {
             tool: TOOL,
-            models: vec![PageModel { role: "original", name: name.to_owned(), bytes: 0, frames: 1, degree: 0, track }],
+            models: vec![PageModelInfo {
+                role: "original",
+                name: name.to_owned(),
+                bytes: 0,
+                frames: 1,
+                degree: 0,
+                track,
+            }],
             cameras: Vec::new(),
             background: [0.0; 3],
             center: [0.0; 3],

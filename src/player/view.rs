@@ -10,7 +10,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
 use crate::models::InputModel;
-use crate::player::page::{ChunkFiles, INDEX_FILE, PageModel, PageScene, cameras, mean_up, training_rig};
+use crate::player::page::{ChunkFiles, INDEX_FILE, PageModelInfo, PageScene, cameras, mean_up, training_rig};
 use crate::player::poster::{self, render_poster};
 use crate::player::quantization::{PlayerSteps, component_count};
 use crate::player::track::{MAX_VALUES_PER_FRAME_GROUP, PageSequence, encode};
@@ -183,7 +183,7 @@ fn add_model(
     limits: &Limits,
     chunks: &mut ChunkFiles,
     events: &Events,
-) -> Result<PageModel> {
+) -> Result<PageModelInfo> {
     let source = model.source();
     let SequenceInfo { times, sh_degree, .. } = source.info();
     let frames = evenly(times.len(), asked.frames);
@@ -194,7 +194,7 @@ fn add_model(
         chunks.add_chunk(place, chunk, since, &bytes)
     })?;
     let name = asked.path.file_name().unwrap_or(asked.path.as_os_str()).to_string_lossy().into_owned();
-    Ok(PageModel {
+    Ok(PageModelInfo {
         role: asked.role,
         name,
         bytes: model.size()?.total(),

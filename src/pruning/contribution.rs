@@ -31,19 +31,19 @@ pub struct VisibleContribution {
 }
 
 impl VisibleContribution {
-    /// Converts the sums and maxima in `found` to contributions C (mean per view, pixels) and peaks W (largest weight
-    /// in a pixel), and returns these. `view_count`: number of views that were rendered; only every `pixel_stride`-th
-    /// column and row of their pixels was rendered.
-    pub fn new(found: &Contribution, view_count: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
+    /// Computes the contributions C (mean per view, pixels) and the peaks W (largest alpha · transmittance) from sums
+    /// and maxima over rendered views. `view_count`: number of these views. `pixel_stride`: only every n-th column and
+    /// row of their pixels was rendered.
+    pub fn from_sums(sums: &Contribution, view_count: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
-        let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / view_count.max(1) as f64).collect();
-        VisibleContribution { coverage, peak: found.max.iter().map(|&max| f64::from(max)).collect() }
+        let coverage = (0..sums.len()).map(|i| sums.in_pixels(i) * per_pixel / view_count.max(1) as f64).collect();
+        VisibleContribution { coverage, peak: sums.max.iter().map(|&max| f64::from(max)).collect() }
     }
 }
 
 /// Renders `views` and returns the contribution of every Gaussian, summed over the views. Only every `pixel_stride`-th
-/// column and row of pixels is rendered. [`VisibleContribution::new`] converts the result to C (mean contribution per
-/// view) and W (largest weight in a pixel).
+/// column and row of pixels is rendered. [`VisibleContribution::from_sums`] converts the result to C (mean contribution
+/// per view) and W (largest weight in a pixel).
 ///
 /// A Gaussian with NaN or infinity in a frame adds nothing in this frame, and a view without pixels adds nothing.
 /// Without views all results are zero. Fails if a frame cannot be read.
@@ -112,7 +112,7 @@ impl RunningContribution {
     /// over the pixels of a view, averaged over the views) and its peak W (largest alpha · transmittance in one pixel).
     pub fn finish(self) -> VisibleContribution {
         let (view_count, pixel_stride) = (self.view_count, self.pixel_stride);
-        VisibleContribution::new(&self.sum(), view_count, pixel_stride)
+        VisibleContribution::from_sums(&self.sum(), view_count, pixel_stride)
     }
 
     fn sum(self) -> Contribution {
@@ -181,7 +181,7 @@ mod tests {
                     )
                     .unwrap()
                 };
-                let seen = VisibleContribution::new(&on_threads(threads, look), sample.len(), scan.pixel_stride);
+                let seen = VisibleContribution::from_sums(&on_threads(threads, look), sample.len(), scan.pixel_stride);
                 for i in 0..2500 {
                     let expected = plain.in_pixels(i) * f64::from(pixel * pixel) / view_count as f64;
                     assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
@@ -200,7 +200,7 @@ mod tests {
             let sample = (&schedule.cameras[..], &scoring_views(&schedule, &scan, 1)[..]);
             let found =
                 visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE, &Events::IGNORED).unwrap();
-            VisibleContribution::new(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
+            VisibleContribution::from_sums(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
         };
         let (all, third) = (total(1), total(3));
         assert!((third / all - 1.0).abs() < 0.02, "got {third}, expected about {all}");
@@ -282,7 +282,7 @@ mod tests {
             &Events::IGNORED,
         )
         .unwrap();
-        let seen = VisibleContribution::new(&seen, sample.len(), recipe.scan.pixel_stride);
+        let seen = VisibleContribution::from_sums(&seen, sample.len(), recipe.scan.pixel_stride);
         assert_eq!((seen.coverage[HIDDEN], seen.peak[HIDDEN]), (0.0, 0.0));
         assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
 
@@ -313,7 +313,7 @@ mod tests {
             let sample = scoring_views(schedule, &strides(1, 1, 1), 1);
             let sample = (&schedule.cameras[..], &sample[..]);
             let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE, &Events::IGNORED).unwrap();
-            VisibleContribution::new(&found, sample.1.len(), NonZeroU32::MIN)
+            VisibleContribution::from_sums(&found, sample.1.len(), NonZeroU32::MIN)
         };
         let seen = look(&scene, &schedule);
         assert_eq!(seen, VisibleContribution { coverage: vec![0.0; 300], peak: vec![0.0; 300] });

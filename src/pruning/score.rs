@@ -16,7 +16,7 @@ use crate::memory_plan::{MemoryPart, ResourceEstimate, Workload};
 use crate::model::RobustBox;
 use crate::model::{AnomalyFlags, Attributes, Gaussians, StatisticRows};
 use crate::models::trajectories::state_bytes;
-use crate::passes::{frames_to_cover, gather};
+use crate::passes::{frames_needed_to_see_all, gather};
 use crate::pruning;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::{Overrides, Ranking, Selection, select};
@@ -73,9 +73,9 @@ pub struct Scored {
     /// Number of frames of the scene.
     frames: usize,
     /// Number of evenly spaced frames that must be rendered so that Gaussians with short life spans are seen too; see
-    /// [`frames_to_cover`].
+    /// [`frames_needed_to_see_all`].
     #[serde(rename = "frames_to_see")]
-    pub frames_to_cover: usize,
+    pub frames_needed_to_see_all: usize,
     /// Terms of the scores: the quantities that are added, each with the percentiles by which it is normalized.
     pub terms: Vec<Term>,
     /// Number of Gaussians with unusual values, for each kind of unusual value (such as NaN).
@@ -199,7 +199,7 @@ impl ScoreStage {
             let median_life = median_life(&rows.life);
             let scored = Scored {
                 frames: info.times.len(),
-                frames_to_cover: frames_to_cover(&rows.life, info.times.len()),
+                frames_needed_to_see_all: frames_needed_to_see_all(&rows.life, info.times.len()),
                 terms: scores.terms,
                 flags: count_flags(&rows),
                 statistics: match scene.limits.statistics_on_disk {

@@ -9,7 +9,7 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{CONTRIBUTION_COST, ResourceEstimate, Workload};
 use crate::model::{Attributes, Statistic, StatisticRows};
-use crate::passes::{frames_to_cover, scoring_views};
+use crate::passes::{frames_needed_to_see_all, scoring_views};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
 use crate::pruning::removal::ranking_stride;
 use crate::recipe::{self, Coverage};
@@ -93,7 +93,7 @@ impl VisibilityStage {
     pub fn run(&self, scene: &Scene, life: &[u32], journal: &mut Journal) -> Result<VisibleContribution> {
         let source = scene.source();
         let count = source.info().count;
-        let frames = frames_to_cover(life, source.info().times.len());
+        let frames = frames_needed_to_see_all(life, source.info().times.len());
         let views = scoring_views(&scene.schedule, &self.recipe, frames);
         let stride = self.pixel_stride(scene.workload().pixels, count);
         let cameras = &scene.schedule.cameras[..];
@@ -107,7 +107,7 @@ impl VisibilityStage {
                 for fraction in parts {
                     sum.merge(&fraction?);
                 }
-                Ok(VisibleContribution::new(&sum, views.len(), stride))
+                Ok(VisibleContribution::from_sums(&sum, views.len(), stride))
             })?;
             Ok((found, count))
         });

@@ -81,7 +81,7 @@ impl RefineStage {
             journal.leave_out(FIT, "no Gaussians were removed");
             return Ok(compressed);
         }
-        let key = (self.key(), &compressed, &seen, photographs.file_stamps(&seen)?, &scored.protected);
+        let key = (self.key(), &compressed, &seen, photographs.file_fingerprints(&seen)?, &scored.protected);
         let key = scene.work.key(&key);
         journal.run_cached_stage(NAME, count, scene, key, |journal| {
             let stride = self.stride(scene.workload().pixels, count);

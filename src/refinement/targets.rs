@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, FrameView, hash_id};
-use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, ViewStates, for_each_view_batch, select_evenly};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly};
 use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
@@ -175,7 +175,7 @@ impl Targets {
         let frame_and_view = |view: &FrameView| (view.frame, view.view);
         let validation: HashSet<(usize, u32)> =
             seen.iter().enumerate().filter(is_validation).map(|(_, view)| frame_and_view(view)).collect();
-        let stamps = photographs.file_stamps(&seen)?;
+        let stamps = photographs.file_fingerprints(&seen)?;
         let (cameras, views) = add_new_views(scene, seen, new_views);
         let purpose = |view: &FrameView| match validation.contains(&frame_and_view(view)) {
             true => Purpose::Validation,
@@ -213,7 +213,7 @@ impl Targets {
                 &self.views[some],
                 BatchLimits::one_frame(&scene.limits),
                 |views| {
-                    let view_values = |(k, (view, renderer)): (usize, (&ViewStates<'_, 1>, &mut Renderer))| {
+                    let view_values = |(k, (view, renderer)): (usize, (&RenderableView<'_, 1>, &mut Renderer))| {
                         let grid = self.grid(next + k, self.stride);
                         Ok(narrow(&match photograph(view.frame_view) {
                             Some(photograph) => sampled(&photograph?, grid),

@@ -198,7 +198,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     let data = CompressedModelData {
         verdict: verdict::verdict(&evaluation, &failure_modes),
         view_scores: evaluation.views.clone(),
-        evaluation: evaluation.with_file_names_only(),
+        evaluation: evaluation.without_folder_paths(),
         render_time,
         failure_modes,
         histograms,

@@ -198,7 +198,7 @@ mod tests {
 
     use super::*;
     use crate::evaluation::cost::{Cost, MedianAndRange};
-    use crate::evaluation::precision::ErrorSource;
+    use crate::evaluation::precision::InaccuracySource;
 
     fn mark(value: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
         let seconds = MedianAndRange::from_values(vec![value]);
@@ -211,7 +211,7 @@ mod tests {
         PrecisionKnob {
             name: "scoring".to_owned(),
             about: "<b>".to_owned(),
-            source: ErrorSource::Discretization,
+            source: InaccuracySource::Discretization,
             curves: vec![PrecisionCurve::new("scoring_views", "all", marks, Some(2.0), &[])],
         }
     }

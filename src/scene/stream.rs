@@ -66,7 +66,9 @@ pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> 
 /// that the container stores together).
 fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<ReceivedStream> {
     let mut quota = frame_quota(options, stream.header())?;
-    ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
+    ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| {
+        quota.count_arrived(held.len())
+    })
 }
 
 /// Returns whether Gaussians of successive frames are linked into tracks (Gaussians followed through frames): if the
@@ -148,11 +150,11 @@ impl FrameQuota {
         FrameQuota { arrived: 0, most, hint, budget }
     }
 
-    /// Counts `frames` frames that have arrived.
+    /// Adds `frames` to the number of frames that have arrived, and checks the new number.
     ///
     /// # Errors
     /// Fails if more frames have arrived than fit into the memory budget.
-    pub fn admit(&mut self, frames: usize) -> Result<()> {
+    pub fn count_arrived(&mut self, frames: usize) -> Result<()> {
         self.arrived += frames as u64;
         if self.arrived <= self.most {
             return Ok(());

@@ -8,7 +8,7 @@ use super::Bench;
 use crate::error::Result;
 use crate::evaluation::cost::Cost;
 use crate::evaluation::precision::{
-    ADDED_ERROR, ErrorSource, KEPT_COUNT_ERROR, KEPT_SET_JACCARD_DISTANCE, PERCENTILE_ERROR, PrecisionCurve,
+    ADDED_ERROR, InaccuracySource, KEPT_COUNT_ERROR, KEPT_SET_JACCARD_DISTANCE, PERCENTILE_ERROR, PrecisionCurve,
     PrecisionKnob, PrecisionSetting, RENDER_ERROR, added_error, jaccard_distance, relative_l2,
 };
 use crate::journal::Journal;
@@ -103,7 +103,7 @@ impl Bench<'_> {
                 "The first pass over the views: contributions C and W of every Gaussian from some of the views, and \
                     which Gaussians the scores based on these keep, before any pruning round."
                     .to_owned(),
-            source: ErrorSource::Discretization,
+            source: InaccuracySource::Discretization,
             curves,
         }))
     }
@@ -199,7 +199,7 @@ impl Bench<'_> {
             about:
                 "Pruning rounds, each ranked by removal error: views of each round, and the fraction that each leaves."
                     .to_owned(),
-            source: ErrorSource::Discretization,
+            source: InaccuracySource::Discretization,
             curves,
         }))
     }
@@ -256,7 +256,7 @@ impl Bench<'_> {
         Ok(PrecisionKnob {
             name: "percentiles".to_owned(),
             about: "Percentiles from one pass over the values: mantissa bits of the histogram's keys.".to_owned(),
-            source: ErrorSource::Discretization,
+            source: InaccuracySource::Discretization,
             curves: vec![curve],
         })
     }

@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::evaluation::cost::Cost;
 use crate::evaluation::method::MethodKind;
 use crate::evaluation::precision::{
-    DIFFERENT_BYTES, ErrorSource, PrecisionCurve, PrecisionKnob, PrecisionSetting, RENDER_ERROR,
+    DIFFERENT_BYTES, InaccuracySource, PrecisionCurve, PrecisionKnob, PrecisionSetting, RENDER_ERROR,
 };
 use crate::memory_plan::{Budget, MemoryPlan};
 use crate::pipeline::planning::InputMeta;
@@ -67,7 +67,7 @@ impl Bench<'_> {
                 "Merging to one count, without choosing between merging and pruning and without refining: radius ε of \
                     one pass (0: pruning alone), and passes of the recipe's own radius."
                     .to_owned(),
-            source: ErrorSource::Model,
+            source: InaccuracySource::Model,
             curves: vec![
                 PrecisionCurve::new("merge radius", WHOLE, by_radius, Some(pass.epsilon), &[]),
                 PrecisionCurve::new("merge passes", WHOLE, by_passes, Some(plain.merge.passes.len() as f64), &[]),
@@ -100,7 +100,7 @@ impl Bench<'_> {
         Ok(Some(PrecisionKnob {
             name: "refining".to_owned(),
             about: "Refining to one count: steps (0: pruning alone), and the number of target views.".to_owned(),
-            source: ErrorSource::Model,
+            source: InaccuracySource::Model,
             curves: vec![
                 PrecisionCurve::new("refine_steps", WHOLE, by_steps, Some(base.refine_steps.into()), &[]),
                 PrecisionCurve::new(
@@ -149,7 +149,7 @@ impl Bench<'_> {
             about:
                 "Threads, and memory in MiB from the smallest possible limit on: the result is the same, byte for byte."
                     .to_owned(),
-            source: ErrorSource::Rounding,
+            source: InaccuracySource::Rounding,
             curves: vec![
                 PrecisionCurve::new("threads", against, by_threads, Some(max_threads as f64), &[]),
                 PrecisionCurve::new("memory, MiB", against, by_memory, None, &[]),

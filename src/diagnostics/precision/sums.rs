@@ -10,7 +10,7 @@ use num_traits::Float;
 
 use super::Bench;
 use crate::error::Result;
-use crate::evaluation::precision::{ErrorSource, PrecisionCurve, PrecisionKnob, PrecisionSetting, relative_l2};
+use crate::evaluation::precision::{InaccuracySource, PrecisionCurve, PrecisionKnob, PrecisionSetting, relative_l2};
 use crate::model::{AnomalyFlags, Attributes, Gaussians, ViewSchedule, opacity};
 use crate::passes::FrameReaders;
 use crate::recipe::{self, MotionParams, Recipe};
@@ -131,7 +131,7 @@ impl Bench<'_> {
                 "Running sums over frames: D, κ and V of {count} Gaussians whose frames are played forward and \
                  backward. Marks are numbers of frames."
             ),
-            source: ErrorSource::Rounding,
+            source: InaccuracySource::Rounding,
             curves,
         }))
     }

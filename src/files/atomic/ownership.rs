@@ -118,7 +118,7 @@ pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result
     for relative in foreign {
         let to = unused_path(new, &relative);
         let made = to.parent().map_or(Ok(()), fs::create_dir_all);
-        result = result.and(made.and_then(|()| old.move_to(&relative, &to)));
+        result = result.and(made.and_then(|()| old.move_entry(&relative, &to)));
     }
     result
 }

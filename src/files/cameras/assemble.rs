@@ -81,12 +81,12 @@ impl RigBuilder {
         &mut self.memory_counter
     }
 
-    /// Begins the camera file `file`, to which the images added next belong, and reserves memory for its `count`
-    /// images.
+    /// Starts a camera file with `count` images: reserves memory for them. The images that are added next belong to
+    /// `file`.
     ///
     /// # Errors
     /// Fails if there are too many images, or if they take more memory than allowed.
-    pub(super) fn begin(&mut self, file: &Path, count: usize) -> Result<()> {
+    pub(super) fn begin_file(&mut self, file: &Path, count: usize) -> Result<()> {
         let total = self.rig.views.len() + count;
         if total > MAX_IMAGES {
             return Err(Error::input(file, "", format!("at most {MAX_IMAGES} images"), total.to_string()));
@@ -102,7 +102,7 @@ impl RigBuilder {
         Ok(())
     }
 
-    /// Adds the image `listed`, which belongs to the file that was last passed to [`RigBuilder::begin`].
+    /// Adds the image `listed`, which belongs to the file that was last passed to [`RigBuilder::begin_file`].
     ///
     /// # Errors
     /// Fails if the camera is invalid, if only some images have a time, or if the memory limit for reading is exceeded.

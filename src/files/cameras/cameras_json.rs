@@ -46,7 +46,7 @@ pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimi
         return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
     }
     let mut builder = RigBuilder::new(memory);
-    builder.begin(file, shared.list_len("frames")?)?;
+    builder.begin_file(file, shared.list_len("frames")?)?;
     each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
         builder.add(per_image(file, CameraFields::new(file, Some(index), frame)?)?)
     })?;
@@ -87,7 +87,7 @@ fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
 /// Reads the `cameras.json` of a 3DGS model folder, a list of `count` cameras.
 pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
     let mut builder = RigBuilder::new(options.memory);
-    builder.begin(file, count)?;
+    builder.begin_file(file, count)?;
     let mut origin = shown_name(file);
     let mut times = Vec::new();
     if options.times != TimesSource::Own {

@@ -128,13 +128,13 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
         }
         let origin = format!("{} (each of {frames} frames)", shown_name(&folder));
         let first_frame = listed.iter().map(listed_image).collect::<Result<Vec<_>>>()?;
-        builder.begin(&images, listed.len() * frames)?;
+        builder.begin_file(&images, listed.len() * frames)?;
         frames::repeat_for_frames(&first_frame, &first, frames).try_for_each(|image| builder.add(image))?;
         return builder.finish(None, origin);
     }
     let names: Vec<Box<str>> = listed.iter().map(|image| image.name.clone()).collect();
     let (given, source) = times::resolve(&images, &names, &options.times, builder.memory_counter())?;
-    builder.begin(&images, listed.len())?;
+    builder.begin_file(&images, listed.len())?;
     for (index, image) in listed.iter().enumerate() {
         builder.add(ListedImage { time: given.get(index).copied().flatten(), ..listed_image(image)? })?;
     }

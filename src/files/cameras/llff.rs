@@ -48,7 +48,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     if options.frames.is_none() {
         origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
     }
-    builder.begin(file, frames * cameras.len())?;
+    builder.begin_file(file, frames * cameras.len())?;
     listed_images(&cameras, frames).try_for_each(|image| builder.add(image))?;
     builder.finish(None, origin)
 }

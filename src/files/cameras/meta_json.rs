@@ -175,7 +175,7 @@ fn add_file(builder: &mut RigBuilder, file: &Path, split: Split) -> Result<usize
         Ok(())
     })?;
     let Tables { intrinsics, poses, images, views } = tables;
-    builder.begin(file, intrinsics.values.len())?;
+    builder.begin_file(file, intrinsics.values.len())?;
     for frame in 0..intrinsics.ends.len() {
         for camera in 0..intrinsics.len(frame) {
             let nothing = || Error::input(file, format!("frame {frame}, key \"w2c\""), POSE, "nothing");

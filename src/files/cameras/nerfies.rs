@@ -44,7 +44,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let metadata = folder.join("metadata.json");
     let warps = warps(&metadata, &ids, builder.memory_counter())?;
     let latest = f64::from(warps.iter().copied().max().unwrap_or(0).max(1));
-    builder.begin(file, splits.iter().map(Vec::len).sum())?;
+    builder.begin_file(file, splits.iter().map(Vec::len).sum())?;
     for ((id, warp), splits) in ids.iter().zip(warps).zip(splits) {
         if splits.is_empty() {
             continue;

@@ -96,7 +96,7 @@ fn latest_in(file: &Path) -> Result<f64> {
 fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
-    builder.begin(file, shared.list_len("frames")?)?;
+    builder.begin_file(file, shared.list_len("frames")?)?;
     let split = split_of(file);
     each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
         builder.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)

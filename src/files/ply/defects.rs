@@ -4,7 +4,7 @@
 use super::write::value;
 use super::{PlaneSource, Ply, PlyEncoding};
 use crate::error::Result;
-use crate::files::defects::{Defects, INFINITE_LOGIT_REPAIR, LISTED_ROWS, first_of};
+use crate::files::defects::{Defects, INFINITE_LOGIT_REPAIR, MAX_LISTED_ROWS, first_of};
 use crate::model::{Attributes, Gaussians, INFINITE_LOGIT};
 
 /// Number of rows (Gaussians) that are read and checked at a time.
@@ -48,7 +48,7 @@ impl Ply {
         let mut block = Gaussians::zeros(0, self.sh_degree());
         for start in (0..self.count).step_by(CHECKED_ROWS) {
             let end = self.count.min(start + CHECKED_ROWS);
-            self.gaussians(start..end, Attributes::all(), &mut block)?;
+            self.gather_range(start..end, Attributes::all(), &mut block)?;
             found.add(start, &block);
         }
         Ok(found.notes())
@@ -98,7 +98,7 @@ impl RowDefects<'_> {
             if !Attributes::all().iter().all(is_finite) {
                 let (first, count) = &mut self.non_finite;
                 *count += 1;
-                first.extend((first.len() < LISTED_ROWS).then_some((start + row) as u32));
+                first.extend((first.len() < MAX_LISTED_ROWS).then_some((start + row) as u32));
             }
         }
     }

@@ -184,7 +184,7 @@ impl Ply {
         let bytes = 4 * Attributes::all().width(self.sh_degree()) as u64 * self.count as u64;
         self.memory.check(&self.path, "element vertex", "the Gaussians of the file", bytes)?;
         let mut out = Gaussians::zeros(self.count, self.sh_degree());
-        self.gaussians(0..self.count, Attributes::all(), &mut out)?;
+        self.gather_range(0..self.count, Attributes::all(), &mut out)?;
         Ok(out)
     }
 
@@ -214,7 +214,7 @@ impl Ply {
     }
 
     /// Writes the attributes `want` of the Gaussians with indices `range` into `out`, as [`Ply::gather`] does.
-    pub fn gaussians(&self, range: Range<usize>, want: Attributes, out: &mut Gaussians) -> Result<()> {
+    pub fn gather_range(&self, range: Range<usize>, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.gather(&Ids::Range(range), want, out)
     }
 

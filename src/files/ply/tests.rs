@@ -77,7 +77,7 @@ fn refusal(bytes: &[u8]) -> String {
 
 fn all(ply: &Ply) -> Gaussians {
     let mut out = Gaussians::zeros(0, ply.sh_degree());
-    ply.gaussians(0..ply.count(), Attributes::all(), &mut out).unwrap();
+    ply.gather_range(0..ply.count(), Attributes::all(), &mut out).unwrap();
     out
 }
 
@@ -134,7 +134,7 @@ fn any_list_of_ids_reads_the_same_rows() {
         assert_eq!(out.sh.row::<12>(i), whole.sh.row::<12>(id as usize));
         assert_eq!(out.position.row::<3>(i), whole.position.row::<3>(id as usize));
     }
-    ply.gaussians(120..260, Attributes::ROTATION, &mut out).unwrap();
+    ply.gather_range(120..260, Attributes::ROTATION, &mut out).unwrap();
     assert_eq!(out.rotation.plane(2), &whole.rotation.plane(2)[120..260]);
 }
 
@@ -143,7 +143,7 @@ fn unrequested_attributes_are_unchanged() {
     let ply = open(&float_file(3)).unwrap();
     let mut out = Gaussians::zeros(3, 1);
     out.sh.planes_mut().fill(7.0);
-    ply.gaussians(0..3, Attributes::all().difference(Attributes::SH), &mut out).unwrap();
+    ply.gather_range(0..3, Attributes::all().difference(Attributes::SH), &mut out).unwrap();
     assert!(out.sh.planes().iter().all(|&x| x == 7.0));
     assert_eq!(out.position, expected(3, &names()).position);
 }
@@ -152,11 +152,11 @@ fn unrequested_attributes_are_unchanged() {
 fn ids_beyond_the_last_gaussian_are_refused() {
     let ply = open(&float_file(3)).unwrap();
     let mut out = Gaussians::zeros(0, 1);
-    assert!(ply.gaussians(1..4, Attributes::all(), &mut out).unwrap_err().to_string().contains("Gaussian 3 "));
+    assert!(ply.gather_range(1..4, Attributes::all(), &mut out).unwrap_err().to_string().contains("Gaussian 3 "));
     assert!(
         ply.gather(&Ids::List(&[0, 9]), Attributes::all(), &mut out).unwrap_err().to_string().contains("Gaussian 9 ")
     );
-    ply.gaussians(3..3, Attributes::all(), &mut out).unwrap();
+    ply.gather_range(3..3, Attributes::all(), &mut out).unwrap();
 }
 
 #[test]
@@ -360,7 +360,7 @@ fn open_and_read(bytes: &[u8], path: &Path) -> bool {
     match Ply::open(path) {
         Ok(ply) => {
             let mut out = Gaussians::default();
-            ply.gaussians(0..ply.count(), Attributes::all(), &mut out).unwrap();
+            ply.gather_range(0..ply.count(), Attributes::all(), &mut out).unwrap();
             assert!(ply.count() <= bytes.len() && out.len() == ply.count());
             true
         }

@@ -190,7 +190,7 @@ impl Packer {
                 self.add_npz(file, &bytes, axis)?
             }
             FileContent::Other if name == "cfg_args" => {
-                bytes = cfg_args::with_file_names_only(&cfg_args::read(file)?, file)?.into_bytes();
+                bytes = cfg_args::without_folder_paths(&cfg_args::read(file)?, file)?.into_bytes();
                 Vec::new()
             }
             FileContent::Other => {

@@ -216,7 +216,7 @@ pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize)
 /// archives are made to be shared. The strings of `source_path` and `model_path`, and all strings that are absolute
 /// paths, are replaced by their last path components; all other bytes are unchanged. Fails if `text` is not a
 /// `Namespace(…)`.
-pub(in crate::models) fn with_file_names_only(text: &str, path: &Path) -> Result<String> {
+pub(in crate::models) fn without_folder_paths(text: &str, path: &Path) -> Result<String> {
     let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (mut out, mut end) = (String::with_capacity(text.len()), 0);
     for key in &keys {
@@ -349,11 +349,11 @@ mod tests {
  extra={'a': ['/home/eve/secret/x', 1]}, posix=PosixPath('/home/eve/it\'s'), w='C:\\secret\\y', eval=True)"#;
         let expected = r#"Namespace(sh_degree=3, source_path='data', model_path="run 1", images='images/2x',
  extra={'a': ['x', 1]}, posix=PosixPath('s'), w='y', eval=True)"#;
-        let found = with_file_names_only(text, Path::new("cfg_args")).unwrap();
+        let found = without_folder_paths(text, Path::new("cfg_args")).unwrap();
         assert_eq!(found, expected);
-        assert_eq!(with_file_names_only(&found, Path::new("cfg_args")).unwrap(), expected);
+        assert_eq!(without_folder_paths(&found, Path::new("cfg_args")).unwrap(), expected);
         let plain = "Namespace(sh_degree=3, source_path='', eval=True)";
-        assert_eq!(with_file_names_only(plain, Path::new("cfg_args")).unwrap(), plain);
+        assert_eq!(without_folder_paths(plain, Path::new("cfg_args")).unwrap(), plain);
     }
 
     fn parse(text: &str) -> Result<ModelConfig> {

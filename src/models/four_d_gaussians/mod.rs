@@ -161,7 +161,7 @@ impl InputModel for ModelFolder {
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
         let cloud = compressed_raw(self.stored(), compressed).gaussians;
         let cfg_args = self.cfg_args(cloud.sh_degree())?;
-        let cfg_args = cfg_args::with_file_names_only(&cfg_args, &paths.cfg_args)?.into_bytes();
+        let cfg_args = cfg_args::without_folder_paths(&cfg_args, &paths.cfg_args)?.into_bytes();
         let mut content = ArchiveContent {
             cloud,
             field: tensors.iter().map(role).collect(),

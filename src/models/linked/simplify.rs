@@ -127,7 +127,7 @@ fn joining_psnr(tracks: &LinkedTracks) -> Result<Option<f64>> {
     for frame in sampled_frames(&frames) {
         let ply = tracks.frames().frame(frame)?;
         let mut all = Gaussians::zeros(0, tracks.frames().sh_degree());
-        ply.gaussians(0..ply.count(), Attributes::all(), &mut all)?;
+        ply.gather_range(0..ply.count(), Attributes::all(), &mut all)?;
         apart.push(all);
         joined.push(tracks.states(&ply, &tracks.rows(frame, 0..tracks.count())?)?);
     }

@@ -153,7 +153,7 @@ impl LinkedTracks {
             };
             options.memory.check(name, &format!("frame {frame}"), "linking the frames", sizes.opening())?;
             let ply = frames.frame(frame)?;
-            ply.gaussians(0..ply.count(), Attributes::all(), &mut state)?;
+            ply.gather_range(0..ply.count(), Attributes::all(), &mut state)?;
             let linked = linker.link(&state);
             live_tracks = live_tracks.max(linker.open_track_count());
             if let Some(joiner) = &mut joiner {

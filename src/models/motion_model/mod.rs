@@ -18,7 +18,8 @@ use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
 use crate::source::{
-    BlockReader, Deformation, DeformedGaussians, FeatureDecoder, FrameSource, Ids, ReadCounts, ReadPlan, SharedCounter,
+    BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, PreparedDeformation, ReadCounts, ReadPlan,
+    SharedCounter,
 };
 
 pub(super) use proxies::propose_proxies;
@@ -301,7 +302,7 @@ impl<L: MotionModel> Deformation for MotionModelFrames<L> {
         self.motion_model.movable()
     }
 
-    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a> {
+    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn PreparedDeformation + 'a> {
         Box::new(MovingGaussians { model: self, stored, ids: (0..stored.len() as u32).collect() })
     }
 }
@@ -322,7 +323,7 @@ impl<L: MotionModel> MovingGaussians<'_, L> {
     }
 }
 
-impl<L: MotionModel> DeformedGaussians for MovingGaussians<'_, L> {
+impl<L: MotionModel> PreparedDeformation for MovingGaussians<'_, L> {
     fn state(&self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let time = self.model.frame_time(frame)?;
         let parts = BlockSlices::split(out, want, self.ids.len());

@@ -4,7 +4,7 @@ use std::io::Read;
 use std::path::Path;
 
 use super::WindowedModel;
-use crate::files::ftgs::{Ftgs, MARKER_COMMENT};
+use crate::files::ftgs::{FtgsFile, MARKER_COMMENT};
 use crate::files::open::open_file;
 use crate::models::archive::reopen::Reopener;
 use crate::models::free_time_gs::frame_state::FreeTime;
@@ -21,7 +21,7 @@ pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply") && has_marker(found.path),
     open: |path, options| {
         options.refuse_for(path)?;
-        let file = Ftgs::open(path, &options.ply(), options.conventions.zero_rotation.unwrap_or_default())?;
+        let file = FtgsFile::open(path, &options.ply(), options.conventions.zero_rotation.unwrap_or_default())?;
         let motion = FreeTime {
             clip: file.header.clip,
             deviation_floor: [file.header.min_deviation.max(SMALLEST_DEVIATION), 0.0],

@@ -3,7 +3,9 @@ use std::path::Path;
 
 use super::*;
 use crate::compressed_model::ParamDelta;
-use crate::files::ftgs::{ClipTimes, Ftgs, LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY, write_ftgs};
+use crate::files::ftgs::{
+    ClipTimes, FtgsFile, LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY, write_ftgs,
+};
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
 use crate::files::tsog::read::read_tsog;
@@ -94,7 +96,7 @@ fn a_smaller_ftgs_keeps_the_values_of_its_rows() {
     write_ftgs(&params(), &clip, &path).unwrap();
     let model = open_at(&path, &[1.0, 1.5, 2.0]);
     assert!(write(&*model, &pruned(vec![2, 7, 9]), OutputKind::Ftgs, &small).is_empty());
-    let found = Ftgs::open(&small, &PlyOptions::default(), ZeroRotation::Drop).unwrap();
+    let found = FtgsFile::open(&small, &PlyOptions::default(), ZeroRotation::Drop).unwrap();
     assert_eq!((found.params, found.header.clip), (params().pick(&[2, 7, 9]), clip));
     assert_eq!(model.size_written(OutputKind::Ftgs, &small).unwrap().cloud, fs::metadata(&small).unwrap().len());
 }

@@ -12,7 +12,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::{decibels_text, psnr};
 use crate::model::{Attributes, FrameView};
-use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, ViewStates, for_each_view_batch, select_evenly};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Message;
@@ -158,7 +158,7 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, views: &[F
     let max_batch = BatchLimits { views: views_together, ..BatchLimits::one_frame(&scene.limits) };
     let subjects = [RenderedSource::all_gaussians(scene.source()), RenderedSource::all_gaussians(&*result)];
     for_each_view_batch(subjects, &scene.schedule.cameras, views, max_batch, |batch| {
-        let image = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
+        let image = |subject: usize, view: &RenderableView<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = batch.iter().map(|view| image(0, view)).collect();
         // All views of a batch show the same frame.
         let state = batch[0].states[0].pick(pruned);

@@ -6,7 +6,7 @@
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
-use crate::journal::records::FieldSummary;
+use crate::journal::records::FieldPrecisionSummary;
 use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::psnr;
@@ -127,7 +127,7 @@ impl FieldPrecisionStage {
         };
         drop((exact, half));
         let least = result.map_or(MAX_USEFUL_PSNR, |result| min_psnr(result, self.margin));
-        let found = FieldSummary { views: views.len(), rounding, result, least, half: rounding >= least };
+        let found = FieldPrecisionSummary { views: views.len(), rounding, result, least, half: rounding >= least };
         let fits = found.half;
         if !fits {
             journal.leave_out(what, found.why());

@@ -158,7 +158,7 @@ impl Stage for MeasureStages {
         }
     }
 
-    fn shardable_units(&self, scene: &Scene, _: &CountPlan) -> Vec<String> {
+    fn describe_shardable_work(&self, scene: &Scene, _: &CountPlan) -> Vec<String> {
         let mut units = vec![format!("{}: {} blocks of Gaussians", scan::NAME, scan_units(scene.source().info()))];
         if let Some(visible) = &self.visible {
             let most = match visible.recipe.scoring_views {

@@ -132,7 +132,7 @@ impl Stage for MergeStage {
         format!("merge: {} passes", self.recipe.passes.len())
     }
 
-    fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
+    fn describe_shardable_work(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
         self.recipe.passes.iter().map(|_| format!("{PAIRS}: pairs of neighbors")).collect()
     }
 

@@ -21,7 +21,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, Throughput, Workload, bytes_of_survivors};
 use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
 use crate::model::FrameView;
-use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
@@ -202,7 +202,7 @@ fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> 
     let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
     let subjects = [scene.source(), result].map(RenderedSource::all_gaussians);
     for_each_view_batch(subjects, &scene.rig.cameras, views, BatchLimits::one_frame(&scene.limits), |batch| {
-        let score = |view: &ViewStates<'_, 2>| {
+        let score = |view: &RenderableView<'_, 2>| {
             let [original, compressed] = [0, 1].map(|subject| view.render(subject, scene.background));
             progress.advance(1);
             (psnr(&compressed, &original), ssim(&compressed, &original))

@@ -151,7 +151,7 @@ impl ReferenceViews<'_> {
             batch,
             |views| {
                 let first = rendered.len();
-                let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
+                let view = |(k, view): (usize, &crate::passes::RenderableView<'_, 1>)| {
                     finish(first + k, view.render(0, self.scene.background))
                 };
                 rendered.par_extend(views.par_iter().enumerate().map(view));

@@ -38,7 +38,7 @@ impl Stage for RefineStage {
         input.output_fraction >= 1.0 - hardly_seen
     }
 
-    fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
+    fn describe_shardable_work(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
         vec![format!("{}: views", targets::NAME)]
     }
 

@@ -80,7 +80,7 @@ impl Stage for Rounds {
         format!("rounds: each keeps {percent:.0}% of the Gaussians, ranked on {views} views in {groups} groups")
     }
 
-    fn shardable_units(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
+    fn describe_shardable_work(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
         let count = scene.source().info().count;
         let usual = (self.usual * count as f64).ceil() as usize;
         self.shardable_rounds(count, counts.count_after_ranking(usual, count))
@@ -153,7 +153,7 @@ impl Rounds {
     /// Chooses the views by which Gaussians are ranked, and returns them divided into groups. Views of the same frame
     /// are in the same group, unless there are fewer frames than groups.
     fn view_groups(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
-        let views = select_evenly_over_frames(&scene.schedule, self.views, scored.frames_to_cover);
+        let views = select_evenly_over_frames(&scene.schedule, self.views, scored.frames_needed_to_see_all);
         let by_frame: Vec<&[FrameView]> = views.chunk_by(|a, b| a.frame == b.frame).collect();
         let parts = if by_frame.len() < self.groups { views.chunks(1).collect() } else { by_frame };
         let mut groups = vec![Vec::new(); self.groups.min(parts.len())];
@@ -397,7 +397,7 @@ mod tests {
         for (groups, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
             let rounds = Rounds { groups, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
             let parts = rounds.view_groups(&scene, &scored);
-            let all = select_evenly_over_frames(&scene.schedule, rounds.views, scored.frames_to_cover);
+            let all = select_evenly_over_frames(&scene.schedule, rounds.views, scored.frames_needed_to_see_all);
             assert_eq!(parts.len(), groups.min(all.len()));
             let mut together: Vec<FrameView> = parts.concat();
             together.sort_by_key(|view| (view.frame, view.view));

@@ -125,7 +125,7 @@ impl FolderHandle {
     ///
     /// # Errors
     /// Fails if there is no entry `from` or the system refuses.
-    pub fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
+    pub fn move_entry(&self, from: &Path, to: &Path) -> io::Result<()> {
         let moved = || rustix::fs::renameat(&self.0, from, CWD, to);
         let refused = match moved() {
             Err(error) if is_denied(error) && self.has_folder(from) => error,

@@ -121,7 +121,7 @@ impl FolderHandle {
     ///
     /// # Errors
     /// Fails if there is no entry `from` or the system refuses.
-    pub fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
+    pub fn move_entry(&self, from: &Path, to: &Path) -> io::Result<()> {
         fs::rename(self.entry_path(from)?, to)
     }
 

@@ -37,7 +37,7 @@ fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutputRow> {
 
 fn all(ply: &Ply) -> Gaussians {
     let mut out = Gaussians::zeros(0, ply.sh_degree());
-    ply.gaussians(0..ply.count(), Attributes::all(), &mut out).unwrap();
+    ply.gather_range(0..ply.count(), Attributes::all(), &mut out).unwrap();
     out
 }
 

@@ -15,7 +15,7 @@ use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
 use crate::source::{
-    BlockReader, Deformation, DeformedGaussians, FrameSource, Ids, ReadCounts, ReadPlan, SharedCounter,
+    BlockReader, Deformation, FrameSource, Ids, PreparedDeformation, ReadCounts, ReadPlan, SharedCounter,
 };
 use rayon::prelude::*;
 
@@ -293,7 +293,7 @@ impl Deformation for ModelFolder {
         if self.field.has_mask() { Attributes::all().difference(Attributes::POSITION) } else { Attributes::all() }
     }
 
-    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a> {
+    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn PreparedDeformation + 'a> {
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let position = &stored.gaussians.position;
         let prepare = |ids: &[u32]| self.field.prepare_with_slopes(&position.pick(ids));
@@ -323,7 +323,7 @@ impl PreparedModel<'_> {
     }
 }
 
-impl DeformedGaussians for PreparedModel<'_> {
+impl PreparedDeformation for PreparedModel<'_> {
     fn state(&self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let (field, sh_degree, time) = (&self.model.field, self.model.info.sh_degree, self.model.frame_time(frame)?);
         let nothing = || Gaussians::zeros(0, sh_degree);
