@@ -126,10 +126,10 @@ impl CacheDir {
         fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the work folder", &self.folder))
     }
 
-    /// Writes a cache entry `name` with the value `found`.
-    pub(super) fn write<T: Serialize>(&self, name: &EntryName, found: &T) -> Result<()> {
+    /// Writes a cache entry `name` with the value `value`.
+    pub(super) fn write<T: Serialize>(&self, name: &EntryName, value: &T) -> Result<()> {
         let mut writer = self.begin_entry(name)?;
-        writer.write_value(found)?;
+        writer.write_value(value)?;
         writer.finish()?;
         Ok(())
     }

@@ -64,11 +64,11 @@ pub fn list_results(folder: &Path) -> Result<Vec<StoredResult>> {
     Ok(found)
 }
 
-/// Formats `listed`, the stored results of a work folder, as text for the terminal: a line for each input that results
+/// Formats `results`, the stored results of a work folder, as text for the terminal: a line for each input that results
 /// belong to, and below it one line per result.
-pub fn format_list(listed: &[StoredResult]) -> String {
+pub fn format_list(results: &[StoredResult]) -> String {
     let mut out = String::new();
-    for run_entries in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
+    for run_entries in results.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
         let bytes = ByteSize(run_entries.iter().map(|entry| entry.bytes).sum());
         let belongs_to = if run_entries[0].belongs_to.is_empty() { "damaged" } else { &run_entries[0].belongs_to };
         _ = writeln!(out, "{belongs_to}: {}", bytes.display().si());
@@ -83,7 +83,7 @@ pub fn format_list(listed: &[StoredResult]) -> String {
             _ = writeln!(out, "  {stage:<12} {bytes:>10}  {state}  {}", &key[..8]);
         }
     }
-    if listed.is_empty() {
+    if results.is_empty() {
         out.push_str("no results are stored here\n");
     }
     out

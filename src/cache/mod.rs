@@ -63,13 +63,17 @@ impl Cache {
         Cache::default()
     }
 
-    /// Opens the cache in the work folder of `asked`, which is created if it does not exist. `about` describes the
+    /// Opens the cache in the work folder of `request`, which is created if it does not exist. `about` describes the
     /// input for people; it is stored in every entry.
     ///
     /// # Errors
     /// Fails if the folder cannot be created or the path is not a folder.
-    pub fn open(asked: &CacheRequest, about: String) -> Result<Cache> {
-        Ok(Cache { dir: Some(CacheDir::open_or_create(&asked.folder, about)?), part: asked.part, ..Cache::default() })
+    pub fn open(request: &CacheRequest, about: String) -> Result<Cache> {
+        Ok(Cache {
+            dir: Some(CacheDir::open_or_create(&request.folder, about)?),
+            part: request.part,
+            ..Cache::default()
+        })
     }
 
     /// Makes the keys of all entries that are read or written from now on depend on `context` too. `context` is the key
@@ -120,12 +124,12 @@ impl Cache {
         self.read_shard(stage, key, Shard::WHOLE)
     }
 
-    /// Stores the result `found` of `stage` for `key`.
+    /// Stores the result `value` of `stage` for `key`.
     ///
     /// # Errors
     /// Fails if the folder cannot be written.
-    pub fn store<T: Serialize>(&self, stage: &str, key: CacheKey, found: &T) -> Result<()> {
-        self.write_shard(stage, key, Shard::WHOLE, found)
+    pub fn store<T: Serialize>(&self, stage: &str, key: CacheKey, value: &T) -> Result<()> {
+        self.write_shard(stage, key, Shard::WHOLE, value)
     }
 
     /// Returns the result of `stage` for `key` if it is stored. If it is not, computes it with `compute` and stores it.
@@ -325,9 +329,9 @@ impl Cache {
         dir.read(&EntryName::new(stage, dir.key(key), part), |note| self.add_note(note))
     }
 
-    fn write_shard<T: Serialize>(&self, stage: &str, key: CacheKey, part: Shard, found: &T) -> Result<()> {
+    fn write_shard<T: Serialize>(&self, stage: &str, key: CacheKey, part: Shard, value: &T) -> Result<()> {
         let Some(dir) = &self.dir else { return Ok(()) };
-        dir.write(&EntryName::new(stage, dir.key(key), part), found)
+        dir.write(&EntryName::new(stage, dir.key(key), part), value)
     }
 }
 

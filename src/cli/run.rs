@@ -220,9 +220,9 @@ fn write_page(options: &ViewOptions) -> Result<String> {
 }
 
 /// Returns a line of text with the path of a page of the player, its number of frames and its size.
-fn page_text(found: &ViewReport) -> String {
-    let files = if found.files == 1 { String::new() } else { format!(" in {} files", found.files) };
-    format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes)
+fn page_text(report: &ViewReport) -> String {
+    let files = if report.files == 1 { String::new() } else { format!(" in {} files", report.files) };
+    format!("{}: {} frames, {} bytes{files}", report.page.shown(), report.frames, report.bytes)
 }
 
 /// Runs the command `convert`: writes an input in another format and prints a description of the output. A frame stream

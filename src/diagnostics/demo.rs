@@ -296,8 +296,8 @@ fn beside(images: [Image; 3]) -> Image {
 }
 
 impl DemoReport {
-    fn new(found: &report::ReportData) -> DemoReport {
-        let first = &found.result.evaluation;
+    fn new(report_data: &report::ReportData) -> DemoReport {
+        let first = &report_data.result.evaluation;
         let mut models = vec![DemoModel {
             name: SCENE_FILE,
             gaussians: first.count.original,
@@ -305,7 +305,7 @@ impl DemoReport {
             psnr: None,
             ssim: None,
         }];
-        let evaluations = std::iter::once(first).chain(found.others.iter().map(|other| &other.evaluation));
+        let evaluations = std::iter::once(first).chain(report_data.others.iter().map(|other| &other.evaluation));
         models.extend([COMPRESSED_10X_FILE, COMPRESSED_20X_FILE, PRUNED_10X_FILE].into_iter().zip(evaluations).map(
             |(name, of)| DemoModel {
                 name,

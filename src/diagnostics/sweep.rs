@@ -155,33 +155,34 @@ fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     Ok((found, name))
 }
 
-/// Returns the number of Gaussians that remain after merging without pruning, according to the points in `found`.
+/// Returns the number of Gaussians that remain after merging without pruning, according to the points in `trade_off`.
 /// Returns `None` if merging without pruning has not been measured yet.
-fn merge_only_count(found: &TradeOff) -> Option<usize> {
+fn merge_only_count(trade_off: &TradeOff) -> Option<usize> {
     let is_merge_only = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
-    found.points.iter().find(is_merge_only).map(|point| point.count)
+    trade_off.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
 /// Returns whether a run of `method` with the kept fraction `fraction` is known to fail: the method is merging without
-/// pruning, and the points in `found` show that merging alone leaves more Gaussians than this fraction. Such a run is
-/// skipped.
-fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {
-    let wanted = fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
-    wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
+/// pruning, and the points in `trade_off` show that merging alone leaves more Gaussians than this fraction. Such a run
+/// is skipped.
+fn exceeds_merging(method: Method, fraction: Option<f64>, trade_off: &TradeOff) -> bool {
+    let wanted =
+        fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * trade_off.gaussians as f64);
+    wanted.zip(merge_only_count(trade_off)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
 /// Measures one point of the trade-off curves by complete runs of `method`, and returns it. `method_kind`: recipe or
 /// baseline that implements `method`. `fraction`: fraction of the Gaussians to keep; `None`: the method chooses their
-/// number. Also stores the number of compared views in `found`.
+/// number. Also stores the number of compared views in `trade_off`.
 fn measure(
     run: &WholeRun<'_>,
     method: Method,
     fraction: Option<f64>,
     method_kind: &MethodKind,
-    found: &mut TradeOff,
+    trade_off: &mut TradeOff,
 ) -> Result<TradeOffPoint> {
     let (evaluation, cost) = run.run(method_kind, fraction.map(Target::Ratio), |result| run.compare(result))?;
-    found.views = evaluation.cameras.pairs;
+    trade_off.views = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
     Ok(TradeOffPoint {
         method: method.name().to_owned(),

@@ -81,16 +81,16 @@ pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
     Ok(report)
 }
 
-/// Writes the test scene `made` into the existing folder `folder`: its frames to the container `scene.gseq`, its
+/// Writes the test scene `scene` into the existing folder `folder`: its frames to the container `scene.gseq`, its
 /// cameras to `cameras.json`. Returns the paths of both files, in this order. Reports progress to `events`.
 ///
 /// # Errors
 /// Fails if a file cannot be written.
-pub fn write_scene(made: &demo_scene::DemoScene, folder: &Path, events: &Events) -> Result<[PathBuf; 2]> {
+pub fn write_scene(scene: &demo_scene::DemoScene, folder: &Path, events: &Events) -> Result<[PathBuf; 2]> {
     let files = [SCENE_FILE, "cameras.json"].map(|name| folder.join(name));
     let [packed, cameras] = &files;
-    write_sequence(made, OutputKind::Gseq, packed, 1, events)?;
-    fs::write(cameras, cameras_json(&made.rig())).map_err(Error::io("write", cameras))?;
+    write_sequence(scene, OutputKind::Gseq, packed, 1, events)?;
+    fs::write(cameras, cameras_json(&scene.rig())).map_err(Error::io("write", cameras))?;
     Ok(files)
 }
 

@@ -33,9 +33,9 @@ impl ResourceEstimate {
 }
 
 /// Converts bytes of memory per survivor (Gaussian that has not been removed) to bytes per Gaussian of the input.
-/// `left`: fraction of the input's Gaussians that survive.
-pub fn bytes_of_survivors(left: f64, bytes: u64) -> u64 {
-    (left * bytes as f64).ceil() as u64
+/// `fraction`: fraction of the input's Gaussians that survive.
+pub fn bytes_of_survivors(fraction: f64, bytes: u64) -> u64 {
+    (fraction * bytes as f64).ceil() as u64
 }
 
 /// Returns the name of each stage in `estimates` and its estimated wall-clock time in seconds, assuming that all

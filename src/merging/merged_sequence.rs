@@ -72,15 +72,15 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// Opens a reader of the Gaussians with the indices `places` in this sequence, at the frames `wanted`. A proxy
+    /// Opens a reader of the Gaussians with the indices `places` in this sequence, at the frames `plan`. A proxy
     /// (Gaussian that replaces a merged cluster) is computed from its members, the Gaussians of the cluster. The
     /// members of all proxies among `places` are read together, on all threads. Fails if a Gaussian cannot be read.
     ///
     /// Memory for each Gaussian that is read, members of proxies included: its reader, its state at one frame, and 24
     /// bytes.
-    pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
+    pub fn open_together(&self, places: Range<usize>, plan: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
         let inputs = MergedMembers::new(self, places);
-        let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Attributes::all(), wanted)?;
+        let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Attributes::all(), plan)?;
         Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
@@ -102,8 +102,8 @@ impl FrameSource for MergedSequence<'_> {
         Ok(Box::new(MergedSequenceReader::new(self, reader, inputs)))
     }
 
-    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(self.open_together(0..self.survivors.len(), wanted))
+    fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        Some(self.open_together(0..self.survivors.len(), plan))
     }
 
     fn reads(&self) -> ReadCounts {
@@ -205,7 +205,7 @@ impl BlockReader for MergedSequenceReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &ReadPlan) {
-        self.reader.expect(wanted);
+    fn expect(&mut self, plan: &ReadPlan) {
+        self.reader.expect(plan);
     }
 }

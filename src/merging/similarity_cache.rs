@@ -25,20 +25,20 @@ impl SimilarityCache {
         missing
     }
 
-    /// Creates the cache from the measured pairs `found`: in any order, but without duplicates.
-    pub fn new(mut found: Vec<PairSimilarity>) -> Self {
-        found.sort_unstable_by_key(|&(a, b, _)| (a, b));
-        SimilarityCache(found)
+    /// Creates the cache from measured pairs, in any order and without duplicates.
+    pub fn new(mut pairs: Vec<PairSimilarity>) -> Self {
+        pairs.sort_unstable_by_key(|&(a, b, _)| (a, b));
+        SimilarityCache(pairs)
     }
 
-    /// Takes over the measured pairs `found`, none of which may be in the cache yet. If the cache already holds pairs
+    /// Takes over the measured pairs `other`, none of which may be in the cache yet. If the cache already holds pairs
     /// and would then hold more than `max_pairs`, takes over nothing.
-    pub fn merge_from(&mut self, mut found: SimilarityCache, max_pairs: usize) {
+    pub fn merge_from(&mut self, mut other: SimilarityCache, max_pairs: usize) {
         if self.0.is_empty() {
-            *self = found;
-        } else if self.0.len() + found.0.len() <= max_pairs {
-            self.0.reserve_exact(found.0.len());
-            self.0.append(&mut found.0);
+            *self = other;
+        } else if self.0.len() + other.0.len() <= max_pairs {
+            self.0.reserve_exact(other.0.len());
+            self.0.append(&mut other.0);
             self.0.sort_unstable_by_key(|&(a, b, _)| (a, b));
         }
     }

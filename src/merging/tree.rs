@@ -39,13 +39,13 @@ pub struct NearestPoints {
 }
 
 impl NearestPoints {
-    /// Starts a new query: for the `wanted` nearest points to `at`, other than the point with index `query`, within the
-    /// distance `epsilon`.
+    /// Starts a new query: for the `max_neighbors` nearest points to `at`, other than the point with index `query`,
+    /// within the distance `epsilon`.
     ///
     /// Squared distances are summed in f64 and compared with ε².
-    pub fn start_query(&mut self, query: u32, at: [f32; 3], wanted: usize, epsilon: f64) {
+    pub fn start_query(&mut self, query: u32, at: [f32; 3], max_neighbors: usize, epsilon: f64) {
         self.found.clear();
-        (self.query, self.at, self.wanted) = (query, at.map(f64::from), wanted);
+        (self.query, self.at, self.wanted) = (query, at.map(f64::from), max_neighbors);
         self.worst = ((epsilon * epsilon).to_bits(), u32::MAX);
     }
 

@@ -21,18 +21,18 @@ pub(super) fn iteration_numbers(within: &Path) -> Result<Vec<u32>> {
     Ok(found)
 }
 
-/// Finds the subfolder `iteration_K` of `within` for the training iteration `asked`, or for the largest K if `asked` is
-/// `None`. Returns K and the path of the subfolder.
+/// Finds the subfolder `iteration_K` of `within` for the training iteration `requested`, or for the largest K if
+/// `requested` is `None`. Returns K and the path of the subfolder.
 ///
 /// # Errors
 /// Fails if the folder cannot be listed or the requested iteration does not exist; the message lists the existing ones.
-pub(super) fn find_iteration(within: &Path, asked: Option<u32>) -> Result<(u32, PathBuf)> {
+pub(super) fn find_iteration(within: &Path, requested: Option<u32>) -> Result<(u32, PathBuf)> {
     let found = iteration_numbers(within)?;
-    let chosen = asked.map_or(found.last().copied(), |k| found.contains(&k).then_some(k));
+    let chosen = requested.map_or(found.last().copied(), |k| found.contains(&k).then_some(k));
     let Some(k) = chosen else {
         let names: Vec<String> = found.iter().map(|k| format!("iteration_{k}")).collect();
         let available = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-        let wanted = asked.map_or("a folder iteration_<number>".to_owned(), |k| format!("a folder iteration_{k}"));
+        let wanted = requested.map_or("a folder iteration_<number>".to_owned(), |k| format!("a folder iteration_{k}"));
         return Err(Error::input(within, "", wanted, available));
     };
     Ok((k, within.join(format!("iteration_{k}"))))

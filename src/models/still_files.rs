@@ -85,10 +85,10 @@ const FORMATS: [StillFormat; 5] = [
 
 /// Returns whether the file is a compressed PLY: its header has an element `chunk` first, or a packed property near its
 /// start.
-fn has_packed_positions(found: &FoundInput) -> bool {
-    let has = |text: &str| found.head.windows(text.len()).any(|part| part == text.as_bytes());
-    !found.is_folder
-        && found.head.starts_with(b"ply")
+fn has_packed_positions(input: &FoundInput) -> bool {
+    let has = |text: &str| input.head.windows(text.len()).any(|part| part == text.as_bytes());
+    !input.is_folder
+        && input.head.starts_with(b"ply")
         && (has("\nelement chunk ") || has(compressed_ply::MARKER_PROPERTY))
 }
 
@@ -102,16 +102,16 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     },
 };
 
-/// Returns the file format of `found`, which is a file or a folder of files; `None` if the format is none of
+/// Returns the file format of `input`, which is a file or a folder of files; `None` if the format is none of
 /// [`FORMATS`].
-fn format_of(found: &FoundInput) -> Option<&'static StillFormat> {
+fn format_of(input: &FoundInput) -> Option<&'static StillFormat> {
     let holds_frames = |format: &StillFormat| {
-        let entries = fs::read_dir(found.path).ok().filter(|_| found.is_folder);
+        let entries = fs::read_dir(input.path).ok().filter(|_| input.is_folder);
         entries.is_some_and(|mut entries| {
             entries.any(|entry| entry.is_ok_and(|entry| is_frame(&entry.path(), format.ending)))
         })
     };
-    FORMATS.iter().find(|format| (format.recognizes)(found) || holds_frames(format))
+    FORMATS.iter().find(|format| (format.recognizes)(input) || holds_frames(format))
 }
 
 /// Returns whether `path` is named like a frame of the format with the ending `ending`, and is not hidden.

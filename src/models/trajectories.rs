@@ -208,12 +208,17 @@ pub fn write_sequence(
 }
 
 /// Writes every frame of `source` to a file `frame_0000.sog`, `frame_0001.sog`, … in the folder `path`, without the
-/// Gaussians that are not drawn in this frame. Returns a note with the largest errors of all frames. At most `held`
-/// decoded frames are kept in memory.
-fn write_sog_sequence(source: &dyn FrameSource, path: &Path, held: usize, events: &Events) -> Result<Vec<String>> {
+/// Gaussians that are not drawn in this frame. Returns a note with the largest errors of all frames. At most
+/// `frames_in_memory` decoded frames are kept in memory.
+fn write_sog_sequence(
+    source: &dyn FrameSource,
+    path: &Path,
+    frames_in_memory: usize,
+    events: &Events,
+) -> Result<Vec<String>> {
     let frames = source.info().times.len();
     let progress = events.task("emit", "frames", frames as u64);
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(frames_in_memory))?;
     let mut errors = SogErrors::default();
     for frame in 0..frames {
         let state = visible_only(states.read(frame)?);

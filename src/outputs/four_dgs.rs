@@ -105,10 +105,10 @@ fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     }
 }
 
-/// Checks that the rounded positions in `set` are close to `wanted`, the positions before rounding. `ids` has for each
-/// piece (of straight motion) the index of its Gaussian, for the error message.
-fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
-    let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
+/// Checks that the rounded positions in `set` are close to `expected`, the positions before rounding. `ids` has for
+/// each piece (of straight motion) the index of its Gaussian, for the error message.
+fn check_positions(set: &GaussianSet, expected: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
+    let planes = (0..3).flat_map(|axis| expected.iter().skip(axis).step_by(3).copied()).collect();
     let mut accuracy = CodingErrors::new(&AttributeValues::from_planes(3, planes));
     for (k, id) in ids.enumerate() {
         let triple = |values: &[f32]| [0, 1, 2].map(|axis| f64::from(values[3 * k + axis]));
@@ -119,7 +119,7 @@ fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = 
             opacity,
             color: [0.0; 3],
         };
-        accuracy.add(id, &drawn(wanted), &drawn(&set.positions));
+        accuracy.add(id, &drawn(expected), &drawn(&set.positions));
     }
     accuracy.check("a .4dgs")
 }

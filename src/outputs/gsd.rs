@@ -39,18 +39,18 @@ const MORTON_BITS: u32 = 10;
 
 /// Writes all frames of `source` to the `.gsd` file `path`. Returns a message for the user: number of Gaussians and
 /// frame rate of the file, and the parts of the input that it does not contain. Some sources decode several frames
-/// together; at most `held` decoded frames are then kept in memory.
+/// together; at most `frames_in_memory` decoded frames are then kept in memory.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
-pub fn write_gsd(source: &dyn FrameSource, path: &Path, held: usize, events: &Events) -> Result<String> {
+pub fn write_gsd(source: &dyn FrameSource, path: &Path, frames_in_memory: usize, events: &Events) -> Result<String> {
     let info = source.info();
     let progress = events.task("emit", "frames", info.times.len() as u64);
     // The JSON text holds the lengths of all blocks and comes first, so blocks are collected in a scratch file.
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let scratch = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
     let mut blocks = BufWriter::new(scratch);
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(frames_in_memory))?;
     let (mut frames, mut most, mut left_out) = (Vec::<Value>::new(), 0, 0);
     for frame in 0..info.times.len() {
         let packed = PackedFrame::new(states.read(frame)?);

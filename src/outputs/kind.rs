@@ -49,11 +49,11 @@ pub enum OutputKind {
 
 impl OutputKind {
     /// Returns the kind of output, from the first of these sources that gives one:
-    /// - `asked`: the kind that the user named.
+    /// - `requested`: the kind that the user named.
     /// - The ending of `path`.
     /// - `input_kind`: the kind of the input.
-    pub fn from_path(path: &Path, asked: Option<OutputKind>, input_kind: OutputKind) -> OutputKind {
-        asked.or(Self::from_name(path)).unwrap_or(input_kind)
+    pub fn from_path(path: &Path, requested: Option<OutputKind>, input_kind: OutputKind) -> OutputKind {
+        requested.or(Self::from_name(path)).unwrap_or(input_kind)
     }
 
     /// Checks the ending of the file name `path`, for users who name no kind of output. Allowed are the endings of all

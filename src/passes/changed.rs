@@ -69,8 +69,8 @@ impl FrameSource for SourceWithDeltas<'_> {
         )))
     }
 
-    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        let opened = self.source.open_all(wanted)?;
+    fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        let opened = self.source.open_all(plan)?;
         if self.is_unchanged() {
             return Some(opened);
         }
@@ -117,8 +117,8 @@ impl BlockReader for ChangedReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &ReadPlan) {
-        self.reader.expect(wanted);
+    fn expect(&mut self, plan: &ReadPlan) {
+        self.reader.expect(plan);
     }
 }
 

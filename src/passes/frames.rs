@@ -77,8 +77,8 @@ impl BlockReader for FrameReaders<'_> {
         )
     }
 
-    fn expect(&mut self, wanted: &ReadPlan) {
-        self.readers.iter_mut().for_each(|reader| reader.expect(wanted));
+    fn expect(&mut self, plan: &ReadPlan) {
+        self.readers.iter_mut().for_each(|reader| reader.expect(plan));
     }
 }
 

@@ -13,10 +13,10 @@ pub const VIEWS_PER_FRAME: usize = 3;
 /// stride, the work per Gaussian dominates the time of a render.
 const MAX_PIXEL_STRIDE: u32 = 4;
 
-/// Returns the stride n, from 1 to 4, such that every n-th pixel of a view in each direction gives about `wanted`
-/// pixels. `pixels`: number of all pixels of the view. The stride is rounded down.
-pub fn pixel_stride(pixels: u64, wanted: f64) -> NonZeroU32 {
-    let stride = (pixels as f64 / wanted.max(1.0)).sqrt();
+/// Returns the stride n, from 1 to 4, such that every n-th pixel of a view in each direction gives about
+/// `target_pixels` pixels. `pixels`: number of all pixels of the view. The stride is rounded down.
+pub fn pixel_stride(pixels: u64, target_pixels: f64) -> NonZeroU32 {
+    let stride = (pixels as f64 / target_pixels.max(1.0)).sqrt();
     NonZeroU32::new((stride as u32).min(MAX_PIXEL_STRIDE)).unwrap_or(NonZeroU32::MIN)
 }
 

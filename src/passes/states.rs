@@ -18,14 +18,14 @@ pub struct FrameStates<'a> {
 }
 
 impl<'a> FrameStates<'a> {
-    /// Opens a reader of `source` for the frames that `wanted` names.
+    /// Opens a reader of `source` for the frames that `plan` names.
     ///
     /// # Errors
     /// Fails if the source cannot be opened.
-    pub fn open(source: &'a dyn FrameSource, wanted: &ReadPlan) -> Result<FrameStates<'a>> {
+    pub fn open(source: &'a dyn FrameSource, plan: &ReadPlan) -> Result<FrameStates<'a>> {
         let info = source.info();
         Ok(FrameStates {
-            reader: open_all(source, Attributes::all(), wanted)?,
+            reader: open_all(source, Attributes::all(), plan)?,
             varying: info.varying,
             unread: Attributes::all(),
             current: Gaussians::zeros(0, info.sh_degree),

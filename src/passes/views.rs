@@ -46,10 +46,10 @@ impl<'a> RenderedSource<'a> {
         self.source.decoder().filter(|_| self.ids.is_none())
     }
 
-    fn open(&self, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + 'a>> {
+    fn open(&self, plan: &ReadPlan) -> Result<Box<dyn BlockReader + 'a>> {
         Ok(match &self.ids {
-            Some(ids) => Box::new(FrameReaders::open(self.source, ids.clone(), self.columns, wanted)?),
-            None => open_all(self.source, self.columns, wanted)?,
+            Some(ids) => Box::new(FrameReaders::open(self.source, ids.clone(), self.columns, plan)?),
+            None => open_all(self.source, self.columns, plan)?,
         })
     }
 }

@@ -173,14 +173,17 @@ fn run_stages(
     run.written.ok_or_else(|| Error::internal("no stage of the plan wrote a result"))
 }
 
-/// Returns the text of the file `recipe.toml` that is written beside the result. `own` is the digest of the input of
-/// this run. Adds a note to `journal`, the record of the run, if the recipe was made for an input with another digest.
-fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journal) -> String {
-    if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != own) {
-        journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
+/// Returns the text of the file `recipe.toml` that is written beside the result. `input_digest` is the digest of the
+/// input of this run. Adds a note to `journal`, the record of the run, if the recipe was made for an input with another
+/// digest.
+fn recipe_text(input_digest: &str, plan: &RunPlan, request: &Request, journal: &mut Journal) -> String {
+    if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != input_digest) {
+        journal
+            .notes
+            .push(format!("the recipe was made for another input, with digest {other}; this one has {input_digest}"));
     }
     let folder = plan.output.as_ref().map(stages::write::WriteStage::recipe_folder).unwrap_or_default();
-    RecipeRecord::new(request, &plan.measure.score.user, own.to_owned()).text(request, &folder)
+    RecipeRecord::new(request, &plan.measure.score.user, input_digest.to_owned()).text(request, &folder)
 }
 
 /// Returns the error for a result without any Gaussian, which no renderer could show.

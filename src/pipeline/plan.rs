@@ -287,13 +287,13 @@ impl RunPlan {
     }
 }
 
-/// Returns the kind of output (such as archive or model folder) that `request` asks for. `own` is the kind to use if
-/// neither an option nor the name of the output determines one.
+/// Returns the kind of output (such as archive or model folder) that `request` asks for. `default_kind` is the kind to
+/// use if neither an option nor the name of the output determines one.
 ///
 /// # Errors
 /// Fails if options exclude each other, or if no option states the kind and the name of the output ends like a kind of
 /// file that the program does not write.
-fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
+fn checked_output(request: &Request, default_kind: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
     if goal.is_some() && (request.only == PruneOrMerge::Merge || request.target.is_some()) {
         return Err(Error::usage(
@@ -316,7 +316,7 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     if request.kind.is_none() {
         OutputKind::check_name(&request.output)?;
     }
-    let kind = OutputKind::from_path(&request.output, request.kind, own);
+    let kind = OutputKind::from_path(&request.output, request.kind, default_kind);
     let is_archive = kind == OutputKind::Archive;
     if archive_psnr.is_some() && !is_archive {
         return Err(Error::usage("--archive-psnr is for archives: write to NAME.gsz, or --as archive"));

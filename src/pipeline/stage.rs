@@ -158,20 +158,20 @@ pub struct CountPlan {
 }
 
 impl CountPlan {
-    /// Returns the number of Gaussians with which refinement begins. `wanted`: number of Gaussians in the output.
+    /// Returns the number of Gaussians with which refinement begins. `target_count`: number of Gaussians in the output.
     /// `all`: number of Gaussians in the input.
-    pub fn count_before_refinement(&self, wanted: usize, all: usize) -> usize {
-        start_count(self.refinement_starts_at, wanted, all)
+    pub fn count_before_refinement(&self, target_count: usize, all: usize) -> usize {
+        start_count(self.refinement_starts_at, target_count, all)
     }
 
-    /// Returns the number of Gaussians that ranking leaves. `wanted`: number of Gaussians in the output. `all`: number
-    /// of Gaussians in the input. A search for the smallest model with a requested quality tries several models but
-    /// ranks only once. In such a run the result is the number that the smallest tried model needs, whatever `wanted`
-    /// is.
-    pub fn count_after_ranking(&self, wanted: usize, all: usize) -> usize {
+    /// Returns the number of Gaussians that ranking leaves. `target_count`: number of Gaussians in the output. `all`:
+    /// number of Gaussians in the input. A search for the smallest model with a requested quality tries several models
+    /// but ranks only once. In such a run the result is the number that the smallest tried model needs, whatever
+    /// `target_count` is.
+    pub fn count_after_ranking(&self, target_count: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
-        self.count_before_refinement(if self.searches { smallest } else { wanted }, all)
+        self.count_before_refinement(if self.searches { smallest } else { target_count }, all)
     }
 
     /// Returns a line of text for display: how many Gaussians are left after ranking and how many refinement then

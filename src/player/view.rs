@@ -173,12 +173,12 @@ struct ModelView<'a> {
 }
 
 /// Encodes the frames of `model` as model number `place` of the page, and adds the encoded chunks (groups of frames) to
-/// `chunks`. Returns the description of the model for the page. `asked`: settings for this model. `steps`: quantization
-/// steps.
+/// `chunks`. Returns the description of the model for the page. `model_view`: settings for this model. `steps`:
+/// quantization steps.
 fn add_model(
     model: &dyn InputModel,
     place: usize,
-    asked: &ModelView<'_>,
+    model_view: &ModelView<'_>,
     steps: PlayerSteps,
     limits: &Limits,
     chunks: &mut ChunkFiles,
@@ -186,16 +186,16 @@ fn add_model(
 ) -> Result<PageModelInfo> {
     let source = model.source();
     let SequenceInfo { times, sh_degree, .. } = source.info();
-    let frames = evenly(times.len(), asked.frames);
-    let mut track = PageSequence::plan(source, &frames, asked.degree, steps);
+    let frames = evenly(times.len(), model_view.frames);
+    let mut track = PageSequence::plan(source, &frames, model_view.degree, steps);
     let groups = track.groups.clone();
     encode(source, &frames, &mut track, limits.max_kept_frames, events, |chunk, bytes| {
         let since = chunk.checked_sub(1).map_or(0.0, |group| groups[group] as f64 / frames.len() as f64);
         chunks.add_chunk(place, chunk, since, &bytes)
     })?;
-    let name = asked.path.file_name().unwrap_or(asked.path.as_os_str()).to_string_lossy().into_owned();
+    let name = model_view.path.file_name().unwrap_or(model_view.path.as_os_str()).to_string_lossy().into_owned();
     Ok(PageModelInfo {
-        role: asked.role,
+        role: model_view.role,
         name,
         bytes: model.size()?.total(),
         frames: times.len(),

@@ -196,11 +196,11 @@ impl RefineStage {
         }
     }
 
-    /// Returns the number of optimization steps before a prune step: `steps_per_prune` · √(`wanted` / `left`), rounded
-    /// up, for `left` Gaussians now and `wanted` Gaussians after the last prune step. With more Gaussians there are
-    /// fewer steps, because a step takes longer and more of its effect is removed later.
-    fn steps_before(&self, left: usize, wanted: usize) -> usize {
-        (self.steps_per_prune as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
+    /// Returns the number of optimization steps before a prune step: `steps_per_prune` · √(`target_count` / `count`),
+    /// rounded up, for `count` Gaussians now and `target_count` Gaussians after the last prune step. With more
+    /// Gaussians there are fewer steps, because a step takes longer and more of its effect is removed later.
+    fn steps_before(&self, count: usize, target_count: usize) -> usize {
+        (self.steps_per_prune as f64 * (target_count as f64 / count.max(1) as f64).sqrt()).ceil() as usize
     }
 
     /// Returns the minimum fraction of all Gaussians with which refinement begins, before its prune steps remove the
@@ -209,10 +209,10 @@ impl RefineStage {
         self.prunes.then_some(MIN_START_COUNT_FRACTION)
     }
 
-    /// Returns the number of Gaussians with which refinement begins, given that it ends with `wanted` of the `all`
-    /// Gaussians of the model. Prune steps remove the difference.
-    pub fn initial_count(&self, wanted: usize, all: usize) -> usize {
-        start_count(self.min_start_count_fraction(), wanted, all)
+    /// Returns the number of Gaussians with which refinement begins, given that it ends with `target_count` of the
+    /// `all` Gaussians of the model. Prune steps remove the difference.
+    pub fn initial_count(&self, target_count: usize, all: usize) -> usize {
+        start_count(self.min_start_count_fraction(), target_count, all)
     }
 
     /// Returns the resource estimate (bytes of memory, seconds) of refinement for the input `work`. The memory holds
@@ -310,10 +310,10 @@ impl RefineStage {
 }
 
 /// Returns the number of Gaussians with which refinement begins. If there are prune steps, it is the larger of
-/// `wanted`, the number with which refinement ends, and the fraction `starts_at` of the `all` Gaussians of the model;
-/// prune steps then remove the surplus. Without prune steps (`starts_at` is `None`), it is `wanted`.
-pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
-    starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
+/// `target_count`, the number with which refinement ends, and the fraction `starts_at` of the `all` Gaussians of the
+/// model; prune steps then remove the surplus. Without prune steps (`starts_at` is `None`), it is `target_count`.
+pub(crate) fn start_count(starts_at: Option<f64>, target_count: usize, all: usize) -> usize {
+    starts_at.map_or(target_count, |part| target_count.max((part * all as f64).ceil() as usize).min(all))
 }
 
 /// Returns the number of optimization steps of the trajectory delta (values that vary with time), which is optimized

@@ -51,10 +51,10 @@ impl<'a> PrunedModels<'a> {
     }
 }
 
-/// Returns how many of `count` Gaussians the next prune step keeps, if `wanted` are to remain in the end. This is the
-/// fraction [`MIN_KEPT_FRACTION`] of `count`, but at least `wanted`, and less than `count`.
-fn next_size(count: usize, wanted: usize) -> usize {
-    ((MIN_KEPT_FRACTION * count as f64).ceil() as usize).min(count - 1).max(wanted)
+/// Returns how many of `count` Gaussians the next prune step keeps, if `target_count` are to remain in the end. This is
+/// the fraction [`MIN_KEPT_FRACTION`] of `count`, but at least `target_count`, and less than `count`.
+fn next_size(count: usize, target_count: usize) -> usize {
+    ((MIN_KEPT_FRACTION * count as f64).ceil() as usize).min(count - 1).max(target_count)
 }
 
 #[cfg(test)]

@@ -39,8 +39,8 @@ pub const CROP_SIDE_PX: u32 = 64;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewErrorSums {
     /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`]: fast, thin, changing in appearance.
-    /// The squared error of a pixel is divided among the kinds in proportion to their shares in the pixel. The share of a
-    /// kind is the sum of alpha · transmittance over its Gaussians.
+    /// The squared error of a pixel is divided among the kinds in proportion to their shares in the pixel. The share of
+    /// a kind is the sum of alpha · transmittance over its Gaussians.
     kinds: [FailureSums; 3],
     /// Sum over pixels of e²: the squared difference between the renders of the two models, averaged over color
     /// channels.
@@ -181,16 +181,16 @@ pub fn render_kind_shares(state: &Gaussians, kinds: &[KindFlags], camera: &Camer
 /// each kind of Gaussian (fast, thin or changing in appearance).
 /// - `state`: Gaussians of the original at the frame of the view
 /// - `kinds`: for each Gaussian, whether it belongs to each kind
-/// - `taken`: renders of both models
+/// - `renders`: renders of both models
 ///
 /// # Panics
 /// Panics if the sizes of the two renders and of the camera's images differ.
-pub fn sum_errors(state: &Gaussians, kinds: &[KindFlags], camera: &Camera, taken: &RenderedViews) -> ViewErrorSums {
+pub fn sum_errors(state: &Gaussians, kinds: &[KindFlags], camera: &Camera, renders: &RenderedViews) -> ViewErrorSums {
     let shares = render_kind_shares(state, kinds, camera);
-    let (original, compressed) = (brightness(&taken.original), brightness(&taken.compressed));
+    let (original, compressed) = (brightness(&renders.original), brightness(&renders.compressed));
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut found = ViewErrorSums { pixels: (width * height) as f64, ..ViewErrorSums::default() };
-    let error = squared_error(&taken.original, &taken.compressed);
+    let error = squared_error(&renders.original, &renders.compressed);
     for (i, (error, shares)) in error.iter().zip(shares.data.chunks_exact(3)).enumerate() {
         found.error += error;
         // Forward differences; 0 at the far borders.
@@ -320,19 +320,19 @@ fn db(error: f64, weight: f64) -> Option<f64> {
 
 /// Returns the upper left corner (column, row) of the square of a render in which the error of the kind `kind` of
 /// Gaussian is largest.
-/// - `taken`: renders of both models
+/// - `renders`: renders of both models
 /// - `shares`: share of each kind of Gaussian in every pixel, from [`render_kind_shares`]
 ///
 /// The error of a square is the sum of w e² over its pixels, where w is the share of the kind and e² the squared
 /// difference of the renders. A square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal
 /// squares, the first is taken, row by row.
-pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
-    let (width, height) = (taken.original.width as usize, taken.original.height as usize);
+pub fn worst_corner(renders: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
+    let (width, height) = (renders.original.width as usize, renders.original.height as usize);
     let (across, down) = ((CROP_SIDE_PX as usize).min(width), (CROP_SIDE_PX as usize).min(height));
     // sums[y][x] is the sum over the rectangle above and left of (x, y).
     let stride = width + 1;
     let mut sums = vec![0.0; stride * (height + 1)];
-    let error = squared_error(&taken.original, &taken.compressed);
+    let error = squared_error(&renders.original, &renders.compressed);
     for y in 0..height {
         let mut row = 0.0;
         for x in 0..width {
@@ -366,8 +366,8 @@ pub fn crop_square(image: &Image, (left, top): (u32, u32)) -> Image {
 }
 
 /// Returns the PSNR in dB, compressed against original, in the square that [`crop_square`] cuts out at `corner`.
-pub fn crop_psnr(taken: &RenderedViews, corner: (u32, u32)) -> f64 {
-    psnr(&crop_square(&taken.compressed, corner), &crop_square(&taken.original, corner))
+pub fn crop_psnr(renders: &RenderedViews, corner: (u32, u32)) -> f64 {
+    psnr(&crop_square(&renders.compressed, corner), &crop_square(&renders.original, corner))
 }
 
 #[cfg(test)]

@@ -26,14 +26,14 @@ const WORK: [WorkMeasure; 3] = [
 ];
 
 /// Returns the HTML of the page that the command `precision` writes.
-pub fn page(found: &PrecisionDiagram) -> String {
-    let title = format!("{} – error against run time", file_name(&found.path));
+pub fn page(diagram: &PrecisionDiagram) -> String {
+    let title = format!("{} – error against run time", file_name(&diagram.path));
     let mut body = format!(
         "<header>\n<h1>Error against run time: {}</h1>\n</header>\n{}",
-        escape(file_name(&found.path)),
-        conditions(found)
+        escape(file_name(&diagram.path)),
+        conditions(diagram)
     );
-    for knob in &found.knobs {
+    for knob in &diagram.knobs {
         body += &format!(
             "<section>\n<h2>{} <small>({} error)</small></h2>\n{}</section>\n",
             escape(&knob.name),
@@ -44,36 +44,36 @@ pub fn page(found: &PrecisionDiagram) -> String {
     body += &format!(
         "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
         links(&["precision.json", "precision.csv"]),
-        escape(&found.tool)
+        escape(&diagram.tool)
     );
     document(&title, &body, &[])
 }
 
 /// Returns the work-precision diagrams as an HTML section of a report.
-pub(super) fn section(found: &PrecisionDiagram) -> String {
+pub(super) fn section(diagram: &PrecisionDiagram) -> String {
     let knob = |knob: &PrecisionKnob| {
         format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), knob_html(knob))
     };
-    conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
+    conditions(diagram) + &diagram.knobs.iter().map(knob).collect::<String>()
 }
 
 /// Returns the HTML of a paragraph on the conditions under which the diagrams were measured, followed by the notes.
-fn conditions(found: &PrecisionDiagram) -> String {
+fn conditions(diagram: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \
          keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
-        count(found.gaussians),
-        count(found.frames),
-        count(found.views_scored),
-        count(found.frames_scored),
-        found.judged,
-        escape(&found.cameras),
-        count(found.kept),
-        found.threads,
-        found.runs,
-        found.max_setting_seconds,
+        count(diagram.gaussians),
+        count(diagram.frames),
+        count(diagram.views_scored),
+        count(diagram.frames_scored),
+        diagram.judged,
+        escape(&diagram.cameras),
+        count(diagram.kept),
+        diagram.threads,
+        diagram.runs,
+        diagram.max_setting_seconds,
     );
-    said + &list(&found.notes)
+    said + &list(&diagram.notes)
 }
 
 /// Returns the HTML of the charts and tables of one knob (group of parameters that were varied).

@@ -54,17 +54,18 @@ pub struct ChosenRender {
     pub flip: Option<f64>,
 }
 
-/// Returns the renders that the page shows, chosen from the comparison `found`; the worst render comes first. A render
-/// that is chosen for several reasons occurs once, with all its reasons.
-pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
-    let scores = &found.views;
+/// Returns the renders that the page shows, chosen from the comparison `evaluation`; the worst render comes first. A
+/// render that is chosen for several reasons occurs once, with all its reasons.
+pub fn choose_renders(evaluation: &Evaluation) -> Vec<ChosenRender> {
+    let scores = &evaluation.views;
     let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
         places.min_by(|&a, &b| scores[a].loss.psnr.total_cmp(&scores[b].loss.psnr))
     };
     let mut by_psnr: Vec<usize> = (0..scores.len()).collect();
     by_psnr.sort_by(|&a, &b| scores[a].loss.psnr.total_cmp(&scores[b].loss.psnr));
-    let view = found.loss.per_view.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.view);
-    let frame = found.loss.per_frame.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.frame);
+    let view = evaluation.loss.per_view.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.view);
+    let frame =
+        evaluation.loss.per_frame.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.frame);
     let of_view = lowest(&mut (0..scores.len()).filter(|&i| Some(scores[i].view) == view));
     let of_frame = lowest(&mut (0..scores.len()).filter(|&i| Some(scores[i].frame) == frame));
     let wanted = [
@@ -95,11 +96,11 @@ pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
     chosen
 }
 
-/// Returns the chosen renders `choices` with the scores of another compressed model of the same original. `found` is
-/// the evaluation of this other model; the scores in `choices` are those of the first compressed model.
-pub fn with_scores_from(found: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
+/// Returns the chosen renders `choices` with the scores of another compressed model of the same original. `evaluation`
+/// is the evaluation of this other model; the scores in `choices` are those of the first compressed model.
+pub fn with_scores_from(evaluation: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
     let scored = |choice: &ChosenRender| {
-        let ImageScore { psnr, ssim, flip, .. } = found.views[choice.place].loss;
+        let ImageScore { psnr, ssim, flip, .. } = evaluation.views[choice.place].loss;
         ChosenRender { psnr, ssim, flip, ..choice.clone() }
     };
     choices.iter().map(scored).collect()
@@ -126,23 +127,23 @@ pub struct ShownImage {
 ///
 /// # Errors
 /// Fails if the render has no pixels, which PNG does not allow.
-pub fn create_images(choice: &ChosenRender, taken: &RenderedViews) -> Result<ShownImage> {
-    let shrunk = shrinkage(&taken.original, MAX_PIXELS);
-    let difference = difference(&taken.compressed, &taken.original);
+pub fn create_images(choice: &ChosenRender, renders: &RenderedViews) -> Result<ShownImage> {
+    let shrunk = shrinkage(&renders.original, MAX_PIXELS);
+    let difference = difference(&renders.compressed, &renders.original);
     let factor = brightening(&difference);
     let bright = brighter(&difference, factor);
     let mut images = Vec::new();
     for (name, image) in [
-        ("original", Some(&taken.original)),
-        ("compressed", Some(&taken.compressed)),
+        ("original", Some(&renders.original)),
+        ("compressed", Some(&renders.compressed)),
         ("difference", Some(&bright)),
-        ("photograph", taken.truth.as_ref()),
+        ("photograph", renders.truth.as_ref()),
     ] {
         if let Some(image) = image {
             images.push((name, data_uri(&shrink(image, shrunk))?));
         }
     }
-    let size = (taken.original.width.div_ceil(shrunk), taken.original.height.div_ceil(shrunk));
+    let size = (renders.original.width.div_ceil(shrunk), renders.original.height.div_ceil(shrunk));
     Ok(ShownImage { choice: choice.clone(), images, size, shrunk, factor })
 }
 

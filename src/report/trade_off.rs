@@ -20,38 +20,39 @@ pub type Chart = (String, String);
 type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 
 /// Returns the HTML of the page that the command `sweep` writes.
-pub fn page(found: &TradeOff) -> String {
+pub fn page(trade_off: &TradeOff) -> String {
     let mut files = vec!["sweep.json", "sweep.csv"];
-    files.extend((!found.knobs.is_empty()).then_some("knobs.csv"));
+    files.extend((!trade_off.knobs.is_empty()).then_some("knobs.csv"));
     let body = format!(
         "<header>\n<h1>What quality costs: {}</h1>\n</header>\n<section>\n{}</section>\n\
          <p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
-        escape(file_name(&found.path)),
-        section(found),
+        escape(file_name(&trade_off.path)),
+        section(trade_off),
         links(&files),
-        escape(&found.tool)
+        escape(&trade_off.tool)
     );
-    document(&format!("{} – what quality costs", file_name(&found.path)), &body, &[])
+    document(&format!("{} – what quality costs", file_name(&trade_off.path)), &body, &[])
 }
 
 /// Returns an HTML section with a description of the sweep, its charts and its notes.
-pub(super) fn section(found: &TradeOff) -> String {
-    let runs = if found.runs > 1 { format!("; times are medians of {} runs", found.runs) } else { String::new() };
-    let paired = curves(found).iter().any(|curve| curve.paired);
+pub(super) fn section(trade_off: &TradeOff) -> String {
+    let runs =
+        if trade_off.runs > 1 { format!("; times are medians of {} runs", trade_off.runs) } else { String::new() };
+    let paired = curves(trade_off).iter().any(|curve| curve.paired);
     let pair = if paired { " Hollow, in the same color: the same method without refinement." } else { "" };
     let mut out = format!(
         "<p class=\"note\">{}: {} Gaussians, {}; {} renders, {} threads{runs}. Lines go from few Gaussians to \
          many.{pair}</p>\n<div class=\"charts\">\n",
-        escape(&found.path),
-        count(found.gaussians),
-        bytes(found.bytes),
-        found.views,
-        found.threads
+        escape(&trade_off.path),
+        count(trade_off.gaussians),
+        bytes(trade_off.bytes),
+        trade_off.views,
+        trade_off.threads
     );
-    for (caption, svg) in charts(found) {
+    for (caption, svg) in charts(trade_off) {
         out += &figure_of(&caption, &svg);
     }
-    out + "</div>\n" + &list(&found.notes)
+    out + "</div>\n" + &list(&trade_off.notes)
 }
 
 /// Returns the HTML of a chart of a search for a quality goal: the numbers of Gaussians that it tried, and the quality
@@ -77,9 +78,9 @@ pub(super) fn search(goal: &GoalSummary) -> String {
 
 /// Returns all charts of a sweep: quality against size, time and memory with a series per method, and a chart of error
 /// against run time for each varied parameter.
-pub fn charts(found: &TradeOff) -> Vec<Chart> {
-    let curves = curves(found);
-    let kept = |point: &TradeOffPoint| Some(100.0 * found.kept_fraction(point));
+pub fn charts(trade_off: &TradeOff) -> Vec<Chart> {
+    let curves = curves(trade_off);
+    let kept = |point: &TradeOffPoint| Some(100.0 * trade_off.kept_fraction(point));
     let megabytes = |point: &TradeOffPoint| Some(point.bytes as f64 / 1e6);
     let seconds = |point: &TradeOffPoint| Some(point.seconds);
     let memory = |point: &TradeOffPoint| point.peak_memory_bytes.map(|bytes| bytes as f64 / (1 << 20) as f64);
@@ -103,14 +104,14 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
         plot("PSNR by run time", log("time to compress, s"), linear("PSNR, dB"), [&seconds, &psnr], true),
         plot("SSIM by run time", log("time to compress, s"), linear("SSIM"), [&seconds, &ssim], true),
     ];
-    charts.extend(found.knobs.iter().map(|knob| effort_chart(knob, found)));
+    charts.extend(trade_off.knobs.iter().map(|knob| effort_chart(knob, trade_off)));
     charts.push(plot("Error by memory", log("peak memory, MiB"), log(ERROR), [&memory, &|p| Some(error(p))], false));
     charts
 }
 
 /// Returns the chart of error against run time with a mark for each tried value of the parameter `knob`. For
 /// comparison, the chart also has a mark for the same method without refinement, at the same number of Gaussians.
-fn effort_chart(knob: &EffortCurve, found: &TradeOff) -> Chart {
+fn effort_chart(knob: &EffortCurve, trade_off: &TradeOff) -> Chart {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
     let is_beside = |point: &&TradeOffPoint| {
@@ -125,13 +126,13 @@ fn effort_chart(knob: &EffortCurve, found: &TradeOff) -> Chart {
         paired: false,
         labels: knob.settings.iter().map(|setting| setting.value.to_string()).collect(),
     }];
-    series.extend(found.points.iter().filter(is_beside).map(|point| Series {
+    series.extend(trade_off.points.iter().filter(is_beside).map(|point| Series {
         name: point.method.clone(),
         points: vec![at(point)],
         paired: true,
         ..Series::default()
     }));
-    let kept = first.map_or(1.0, |point| found.kept_fraction(point));
+    let kept = first.map_or(1.0, |point| trade_off.kept_fraction(point));
     let title = format!("Error by run time, {}% kept, by {}", figure(100.0 * kept), knob.parameter);
     let (x, y) = (log("time to compress, s"), log(ERROR));
     (title.clone(), Plot { title, x, y, series }.svg())
@@ -164,9 +165,9 @@ struct MethodCurve<'a> {
 
 /// Groups the measurements by method, one curve per method. If a method was measured with and without refinement, its
 /// two curves come first: with refinement, then without.
-fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
+fn curves(trade_off: &TradeOff) -> Vec<MethodCurve<'_>> {
     let mut curves: Vec<MethodCurve<'_>> = Vec::new();
-    for point in &found.points {
+    for point in &trade_off.points {
         match curves.iter_mut().find(|curve| curve.name == point.method) {
             Some(curve) => curve.points.push(point),
             None => curves.push(MethodCurve { name: &point.method, points: vec![point], paired: false }),

@@ -18,25 +18,25 @@ const WORDS: [(f64, &str); 6] = [
 
 /// Returns the verdict in two or three sentences: how much smaller the compressed model is, how visible its differences
 /// from the original are, and which kinds of Gaussian are visibly damaged.
-pub(super) fn verdict(found: &Evaluation, modes: &[FailureMode]) -> String {
-    let mean = found.loss.overall;
+pub(super) fn verdict(evaluation: &Evaluation, modes: &[FailureMode]) -> String {
+    let mean = evaluation.loss.overall;
     let of = |part: u64, whole: u64| percent(part as f64, whole as f64);
     let words =
         WORDS.iter().find(|(from, _)| mean.psnr >= *from).map_or("cannot be compared with the original", |w| w.1);
     let mut text = format!(
         "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {} render{}",
-        of(found.count.compressed as u64, found.count.original as u64),
-        of(found.bytes.compressed, found.bytes.original),
+        of(evaluation.count.compressed as u64, evaluation.count.original as u64),
+        of(evaluation.bytes.compressed, evaluation.bytes.original),
         mean.psnr,
         mean.pairs,
         if mean.pairs == 1 { "" } else { "s" },
     );
-    let worst = found.views.iter().min_by(|a, b| a.loss.psnr.total_cmp(&b.loss.psnr));
+    let worst = evaluation.views.iter().min_by(|a, b| a.loss.psnr.total_cmp(&b.loss.psnr));
     if let Some(worst) = worst.filter(|_| mean.pairs > 1) {
         text += &format!(", {:.1} dB in the worst, frame {} of view {}", worst.loss.psnr, worst.frame, worst.view);
     }
     text += ").";
-    if let Some(truth) = &found.ground_truth {
+    if let Some(truth) = &evaluation.ground_truth {
         let lost = truth.original.overall.psnr - truth.compressed.overall.psnr;
         text += &match lost {
             0.005.. => format!(" Against the photographs it is {lost:.2} dB worse than the original."),

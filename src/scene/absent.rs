@@ -58,8 +58,8 @@ impl BlockReader for HidingReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &ReadPlan) {
-        self.reader.expect(wanted);
+    fn expect(&mut self, plan: &ReadPlan) {
+        self.reader.expect(plan);
     }
 
     fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {

@@ -31,8 +31,8 @@ impl FrameSource for Scene {
         Ok(self.absent.hiding(self.input.source().open(ids.clone())?, &ids))
     }
 
-    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        let opened = self.input.source().open_all(wanted)?;
+    fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        let opened = self.input.source().open_all(plan)?;
         Some(opened.map(|reader| self.absent.hiding(reader, &Ids::Range(0..self.info().count))))
     }
 

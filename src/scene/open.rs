@@ -91,17 +91,17 @@ fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<
 }
 
 /// Returns evenly spaced frame times from 0 up to but not including `span`, for a model whose cameras give no times.
-/// `given` is the number of frames that the user asked for. If it is `None`, uses [`DEFAULT_FRAMES`] and adds a message
-/// about this to `notes`.
+/// `requested` is the number of frames that the user asked for. If it is `None`, uses [`DEFAULT_FRAMES`] and adds a
+/// message about this to `notes`.
 ///
 /// # Errors
 /// Fails if the number of frames is not from 1 to 1,000,000.
-fn evenly_spaced(given: Option<usize>, span: f64, notes: &mut Vec<String>) -> Result<Vec<f64>> {
-    let frames = given.unwrap_or(DEFAULT_FRAMES);
+fn evenly_spaced(requested: Option<usize>, span: f64, notes: &mut Vec<String>) -> Result<Vec<f64>> {
+    let frames = requested.unwrap_or(DEFAULT_FRAMES);
     if !(1..=MAX_FRAMES).contains(&frames) {
         return Err(Error::usage(format!("--frames: expected 1 to {MAX_FRAMES}, found {frames}")));
     }
-    if given.is_none() {
+    if requested.is_none() {
         notes.push(format!(
             "neither the cameras nor --frames give the model's frames; using {frames} evenly spaced ones"
         ));

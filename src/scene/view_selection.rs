@@ -127,16 +127,16 @@ pub fn spread_views(views: Vec<FrameView>, most: usize) -> Vec<FrameView> {
 /// Golden ratio. Its multiples are spread evenly modulo 1.
 const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
 
-/// Returns the background color for renders: `asked`, the color that the user gave, or else that of the scene.
+/// Returns the background color for renders: `requested`, the color that the user gave, or else that of the scene.
 ///
 /// # Errors
 /// Fails if a component of the color is not from 0 to 1.
-pub fn render_background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
-    match asked {
+pub fn render_background(requested: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
+    match requested {
         Some(rgb) if rgb.iter().any(|c| !(0.0..=1.0).contains(c)) => {
             Err(Error::usage(format!("--background: expected red, green, blue from 0 to 1, found {rgb:?}")))
         }
-        asked => Ok(asked.unwrap_or(scene.background)),
+        requested => Ok(requested.unwrap_or(scene.background)),
     }
 }
 

@@ -112,29 +112,29 @@ impl RigCone {
     }
 }
 
-/// Sets the weights in `used` (pairs of a unit vector and its weight) to the weights ≥ 0 for which the weighted sum of
-/// the vectors is nearest to `direction`. Removes vectors whose weight is 0. Returns false if the vectors are linearly
-/// dependent.
-fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
+/// Sets the weights in `weighted` (pairs of a unit vector and its weight) to the weights ≥ 0 for which the weighted sum
+/// of the vectors is nearest to `direction`. Removes vectors whose weight is 0. Returns false if the vectors are
+/// linearly dependent.
+fn fit_weights(weighted: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
-        let Some(free) = least_squares(used, direction) else { return false };
+        let Some(free) = least_squares(weighted, direction) else { return false };
         // Fraction of the change from the present weights to `free`, the best weights of any sign, at which the first
         // weight becomes 0.
         let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| (free <= 0.0).then(|| weight / (weight - free));
-        let step = used.iter().zip(&free).filter_map(limit).fold(1.0, f64::min);
-        used.iter_mut().zip(&free).for_each(|((_, weight), free)| *weight += step * (free - *weight));
-        used.retain(|&(_, weight)| weight > 0.0);
+        let step = weighted.iter().zip(&free).filter_map(limit).fold(1.0, f64::min);
+        weighted.iter_mut().zip(&free).for_each(|((_, weight), free)| *weight += step * (free - *weight));
+        weighted.retain(|&(_, weight)| weight > 0.0);
         if step >= 1.0 {
             return true;
         }
     }
 }
 
-/// Returns the weights, of any sign, for which the weighted sum of unit vectors is nearest to `direction`. `used` has
-/// pairs of a unit vector and a weight, which is ignored. Returns `None` if the vectors are linearly dependent or more
-/// than three.
-fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
-    match *used {
+/// Returns the weights, of any sign, for which the weighted sum of unit vectors is nearest to `direction`. `weighted`
+/// has pairs of a unit vector and a weight, which is ignored. Returns `None` if the vectors are linearly dependent or
+/// more than three.
+fn least_squares(weighted: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
+    match *weighted {
         [(a, _)] => Some(vec![a.dot(direction)]),
         [(a, _), (b, _)] => {
             let (cosine, to_a, to_b) = (a.dot(b), a.dot(direction), b.dot(direction));

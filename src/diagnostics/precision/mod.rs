@@ -301,17 +301,17 @@ fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, not
     chosen
 }
 
-/// Writes the results `found` to `folder`: a CSV table, a JSON file, and the page with the diagrams.
-fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
+/// Writes the results `diagram` to `folder`: a CSV table, a JSON file, and the page with the diagrams.
+fn write_files(diagram: &PrecisionDiagram, folder: &Path) -> Result<()> {
     let write = |name: &str, text: String| {
         let path = folder.join(name);
         fs::write(&path, text).map_err(Error::io("write", &path))
     };
-    write("precision.csv", found.csv())?;
-    write("precision.json", found.json())?;
-    write(PAGE_FILE, page(found))?;
+    write("precision.csv", diagram.csv())?;
+    write("precision.json", diagram.json())?;
+    write(PAGE_FILE, page(diagram))?;
     // The marker file lets a later run recognize the folder as one that it may replace.
-    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))
+    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": diagram.tool })))
 }
 
 impl Bench<'_> {

@@ -54,33 +54,33 @@ pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimi
     builder.finish(background, shown_name(file))
 }
 
-/// Builds a list entry of one image (camera, time, split, path) from `own`, the JSON object of this image in a
+/// Builds a list entry of one image (camera, time, split, path) from `fields`, the JSON object of this image in a
 /// `cameras.json` in this project's own format.
-fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
-    let (rotation, translation) = own.pose("w2c")?;
-    let split = match own.optional_text("split")? {
+fn per_image(file: &Path, fields: CameraFields<'_>) -> Result<ListedImage> {
+    let (rotation, translation) = fields.pose("w2c")?;
+    let split = match fields.optional_text("split")? {
         None | Some("train") => Split::Train,
         Some("test") => Split::Test,
         Some("val") => Split::Val,
-        Some(_) => return Err(own.wrong("split", "\"train\", \"val\" or \"test\"")),
+        Some(_) => return Err(fields.wrong("split", "\"train\", \"val\" or \"test\"")),
     };
     let camera = Camera {
-        width: own.side("width")?,
-        height: own.side("height")?,
-        fx: own.number("fx")?,
-        fy: own.number("fy")?,
-        cx: own.number("cx")?,
-        cy: own.number("cy")?,
+        width: fields.side("width")?,
+        height: fields.side("height")?,
+        fx: fields.number("fx")?,
+        fy: fields.number("fy")?,
+        cx: fields.number("cx")?,
+        cy: fields.number("cy")?,
         rotation,
         translation,
         near: Camera::NEAR,
     };
     Ok(ListedImage {
         camera,
-        time: own.optional_number("time")?,
+        time: fields.optional_number("time")?,
         split,
-        image: own.optional_text("image")?.map(|name| file.with_file_name(name)),
-        view: own.optional_index("v")?,
+        image: fields.optional_text("image")?.map(|name| file.with_file_name(name)),
+        view: fields.optional_index("v")?,
     })
 }
 
@@ -112,14 +112,14 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     builder.finish(None, origin)
 }
 
-/// Builds a list entry of one image from `own`, the JSON object of one camera in a `cameras.json` of 3DGS. The list
+/// Builds a list entry of one image from `fields`, the JSON object of one camera in a `cameras.json` of 3DGS. The list
 /// entry holds the camera, the path of the image file and the view number, but no time.
-fn per_camera(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
-    let size @ (width, height) = (own.side("width")?, own.side("height")?);
-    let intrinsics = [own.number("fx")?, own.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];
-    let name = own.optional_text("img_name")?;
+fn per_camera(file: &Path, fields: CameraFields<'_>) -> Result<ListedImage> {
+    let size @ (width, height) = (fields.side("width")?, fields.side("height")?);
+    let intrinsics = [fields.number("fx")?, fields.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];
+    let name = fields.optional_text("img_name")?;
     Ok(ListedImage {
-        camera: from_camera_to_world(size, intrinsics, own.matrix3("rotation")?, own.vector("position")?.into()),
+        camera: from_camera_to_world(size, intrinsics, fields.matrix3("rotation")?, fields.vector("position")?.into()),
         time: None,
         split: Split::Train,
         image: name.map(|name| file.with_file_name(name)),

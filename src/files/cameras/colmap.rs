@@ -68,14 +68,14 @@ struct ColmapImage {
     name: Box<str>,
 }
 
-/// Reads the reconstruction at `found`, which is the folder of the reconstruction, a folder that contains this folder,
+/// Reads the reconstruction at `path`, which is the folder of the reconstruction, a folder that contains this folder,
 /// or one of its files.
 ///
 /// # Errors
 /// Fails if a file is missing, truncated or malformed, if a camera has distortion, or if the times of the images cannot
 /// be found.
-pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
-    let folder = reconstruction_folder(found)?;
+pub(super) fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
+    let folder = reconstruction_folder(path)?;
     let binary = folder.join("cameras.bin").is_file();
     let file = |name: &str| folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" }));
     let (cameras, images) = (file("cameras"), file("images"));
@@ -143,11 +143,11 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     builder.finish(None, origin)
 }
 
-/// Returns the folder that holds the COLMAP files. `found` is a folder or a file in a folder; the result is this folder
+/// Returns the folder that holds the COLMAP files. `path` is a folder or a file in a folder; the result is this folder
 /// or its subfolder `0`. Fails if neither holds a reconstruction.
-fn reconstruction_folder(found: &Path) -> Result<PathBuf> {
+fn reconstruction_folder(path: &Path) -> Result<PathBuf> {
     let holds = |folder: &Path| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file());
-    let folder = if found.is_dir() { found } else { found.parent().unwrap_or(Path::new("")) };
+    let folder = if path.is_dir() { path } else { path.parent().unwrap_or(Path::new("")) };
     [folder.to_owned(), folder.join("0")].into_iter().find(|folder| holds(folder)).ok_or_else(|| {
         Error::input(folder, "", "a COLMAP reconstruction: cameras.bin and images.bin, or both as .txt", "neither")
     })

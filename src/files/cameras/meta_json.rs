@@ -99,17 +99,17 @@ struct Tables {
 }
 
 impl Tables {
-    /// Appends one value to the table of the key `KEYS[key]`: the value of the next camera of the current frame. `own`
-    /// is a JSON object that holds this value under its key.
-    fn take(&mut self, own: CameraFields<'_>, key: usize) -> Result<()> {
+    /// Appends one value to the table of the key `KEYS[key]`: the value of the next camera of the current frame.
+    /// `fields` is a JSON object that holds this value under its key.
+    fn take(&mut self, fields: CameraFields<'_>, key: usize) -> Result<()> {
         match key {
             0 => {
-                let k = own.matrix3("k")?;
+                let k = fields.matrix3("k")?;
                 self.intrinsics.values.push(Some([k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y]));
             }
-            1 => self.poses.values.push(Some(own.pose("w2c")?)),
-            2 => self.images.values.push(own.optional_text("fn")?.map(Into::into)),
-            _ => self.views.values.push(own.optional_index("cam_id")?),
+            1 => self.poses.values.push(Some(fields.pose("w2c")?)),
+            2 => self.images.values.push(fields.optional_text("fn")?.map(Into::into)),
+            _ => self.views.values.push(fields.optional_index("cam_id")?),
         }
         Ok(())
     }

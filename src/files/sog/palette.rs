@@ -94,9 +94,9 @@ impl Palette {
     }
 }
 
-/// Returns `wanted` evenly spaced numbers below `count`.
-fn evenly_spaced(count: usize, wanted: usize) -> impl Iterator<Item = usize> {
-    (0..wanted).map(move |i| (i as u128 * count as u128 / wanted as u128) as usize)
+/// Returns `target_count` evenly spaced numbers below `count`.
+fn evenly_spaced(count: usize, target_count: usize) -> impl Iterator<Item = usize> {
+    (0..target_count).map(move |i| (i as u128 * count as u128 / target_count as u128) as usize)
 }
 
 /// Returns the number of palette entries that each group of vectors gets, when `entries` palette entries are divided in

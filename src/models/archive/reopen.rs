@@ -88,8 +88,8 @@ impl FrameSource for RestoredFrames {
         self.model.source().open(ids)
     }
 
-    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        self.model.source().open_all(wanted)
+    fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        self.model.source().open_all(plan)
     }
 
     fn deformation(&self) -> Option<&dyn Deformation> {

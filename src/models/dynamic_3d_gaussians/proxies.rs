@@ -103,8 +103,8 @@ impl FrameSource for MergedSource<'_> {
         Ok(self.reader(self.merged.open(ids.clone())?, ids))
     }
 
-    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        let opened = self.merged.open_all(wanted)?;
+    fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        let opened = self.merged.open_all(plan)?;
         Some(opened.map(|reader| self.reader(reader, Ids::Range(0..self.info.count))))
     }
 
@@ -138,7 +138,7 @@ impl BlockReader for MergedReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &ReadPlan) {
-        self.reader.expect(wanted);
+    fn expect(&mut self, plan: &ReadPlan) {
+        self.reader.expect(plan);
     }
 }

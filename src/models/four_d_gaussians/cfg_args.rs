@@ -204,12 +204,12 @@ pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) 
     Ok([&text[..place.start], &value, &text[place.end..]].concat())
 }
 
-/// Returns the text of the `cfg_args` file at `path` for an output with SH degree `degree`. `own` is the SH degree of
-/// the input. If `degree` is lower than `own`, `degree` replaces the SH degree in the text; otherwise the text is
-/// unchanged. Fails if the file cannot be read.
-pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
+/// Returns the text of the `cfg_args` file at `path` for an output with SH degree `degree`. `input_degree` is the SH
+/// degree of the input. If `degree` is lower than `input_degree`, `degree` replaces the SH degree in the text;
+/// otherwise the text is unchanged. Fails if the file cannot be read.
+pub(in crate::models) fn read_for_degree(path: &Path, input_degree: usize, degree: usize) -> Result<String> {
     let text = read(path)?;
-    if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }
+    if degree < input_degree { with_sh_degree(&text, degree, path) } else { Ok(text) }
 }
 
 /// Returns `text`, the content of the `cfg_args` file at `path`, without the folders of the training machine, because

@@ -110,8 +110,8 @@ impl FrameSource for LinkedFrames {
         self.container.open(ids)
     }
 
-    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        self.container.open_all(wanted)
+    fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        self.container.open_all(plan)
     }
 
     fn reads(&self) -> ReadCounts {

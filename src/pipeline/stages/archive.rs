@@ -150,7 +150,8 @@ impl ArchiveStage {
         }
     }
 
-    /// Makes an archive of `compressed` that meets the quality or size `asked`. Returns its content and its summary.
+    /// Makes an archive of `compressed` that meets the quality or size `archive_target`. Returns its content and its
+    /// summary.
     ///
     /// # Errors
     /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, if the
@@ -160,19 +161,19 @@ impl ArchiveStage {
         &self,
         scene: &Scene,
         compressed: &CompressedModel,
-        asked: ArchiveTarget,
+        archive_target: ArchiveTarget,
         journal: &mut Journal,
     ) -> Result<(PreparedArchive, ArchiveSummary)> {
-        let key = scene.work.key(&(self.psnr, asked, compressed));
+        let key = scene.work.key(&(self.psnr, archive_target, compressed));
         let (archived, AsToml(summary)) = journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
             let (archived, summary) = match scene.input.archives_as_frames() {
                 true => {
                     let left = scene.input.compressed_frames(compressed)?;
-                    let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
+                    let (bounds, summary) = bounds::find(scene, &*left, self.psnr, archive_target)?;
                     (PreparedArchive::Frames(bounds), summary)
                 }
                 false => {
-                    let (encoded, summary) = self.make(scene, compressed, asked)?;
+                    let (encoded, summary) = self.make(scene, compressed, archive_target)?;
                     (PreparedArchive::Content(encoded), summary)
                 }
             };
@@ -185,14 +186,14 @@ impl ArchiveStage {
         &self,
         scene: &Scene,
         compressed: &CompressedModel,
-        asked: ArchiveTarget,
+        archive_target: ArchiveTarget,
     ) -> Result<(EncodedArchive, ArchiveSummary)> {
         let mut content = scene.input.archive_content(compressed)?;
         let reference_views = ReferenceViews::new(scene, &*scene.input.decode_frames(&content)?)?;
         let original = ReferenceViews::new(scene, scene.source())?;
         let level = check_measurable(reference_views.psnr(scene.source())?)?;
-        let quality_target = QualityTarget::new(self.psnr, asked, level);
-        let asked = quality_target.required_psnr(level);
+        let quality_target = QualityTarget::new(self.psnr, archive_target, level);
+        let required_psnr = quality_target.required_psnr(level);
         let mut grids = Grids::from_content(&content);
         let mut measured = Vec::new();
         let halvings =
@@ -200,7 +201,8 @@ impl ArchiveStage {
         let measurements = BALANCING_ROUNDS * grids.groups.len() + halvings;
         let progress = scene.events.task(NAME, "measurements", measurements as u64);
         for _ in 0..BALANCING_ROUNDS {
-            measured = grids.balance(scene, &reference_views, &mut content, 10f64.powf(-0.1 * asked), &progress)?;
+            measured =
+                grids.balance(scene, &reference_views, &mut content, 10f64.powf(-0.1 * required_psnr), &progress)?;
         }
         let encoded = |added: f64| {
             progress.advance(1);
@@ -235,14 +237,26 @@ impl ArchiveStage {
                         shown => shown?,
                     };
                     Ok(Some(measure_frames(encoded, shown)?)
-                        .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
+                        .filter(|&(_, found)| quality_target.is_met_by(found, required_psnr)))
                 })?;
                 best.map_or_else(|| measure_views(encoded(OCTAVE_RANGE[0])?), Ok)?
             }
         };
-        check_met(quality_target, asked, psnr)?;
+        check_met(quality_target, required_psnr, psnr)?;
         let (parts, bits) = (encoded.parts, encoded.bits.clone());
-        Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts: Some(parts), bounds: None, bits, measured }))
+        Ok((
+            encoded,
+            ArchiveSummary {
+                asked: required_psnr,
+                psnr,
+                level,
+                loss,
+                parts: Some(parts),
+                bounds: None,
+                bits,
+                measured,
+            },
+        ))
     }
 }
 

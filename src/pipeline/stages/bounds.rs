@@ -59,9 +59,9 @@ pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     .concat()
 }
 
-/// Finds error bounds with which an archive of `source`, a result of `scene`, meets the quality or size `asked`. If
-/// `psnr` is given, renders of the archive must have at least this PSNR, dB, against renders of `source`. Returns the
-/// bounds and the summary of the archive.
+/// Finds error bounds with which an archive of `source`, a result of `scene`, meets the quality or size
+/// `archive_target`. If `psnr` is given, renders of the archive must have at least this PSNR, dB, against renders of
+/// `source`. Returns the bounds and the summary of the archive.
 ///
 /// # Errors
 /// Fails if frames cannot be read, if renders are not finite, if an archive with the widest bounds exceeds the byte
@@ -70,20 +70,20 @@ pub(crate) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
     psnr: Option<f64>,
-    asked: ArchiveTarget,
+    archive_target: ArchiveTarget,
 ) -> Result<(ErrorBounds, ArchiveSummary)> {
     let (reference_views, original) =
         (ReferenceViews::new(scene, source)?, ReferenceViews::new(scene, scene.source())?);
     let level = check_measurable(reference_views.psnr(scene.source())?)?;
-    let quality_target = QualityTarget::new(psnr, asked, level);
-    let asked = quality_target.required_psnr(level);
+    let quality_target = QualityTarget::new(psnr, archive_target, level);
+    let required_psnr = quality_target.required_psnr(level);
     let initial_bounds = initial_bounds(source)?;
     let mut widths = initial_bounds;
     let mut measured = Vec::new();
     let progress = scene.events.task("archive", "measurements", (BALANCING_ROUNDS + OCTAVE_HALVINGS) as u64);
     for _ in 0..BALANCING_ROUNDS {
         progress.advance(1);
-        let error = 10f64.powf(-0.1 * asked);
+        let error = 10f64.powf(-0.1 * required_psnr);
         let errors = errors(&reference_views, source, &widths)?;
         let [fine, wide] = [0.0, 0.5].map(|octaves| bits(source, widened(&widths, octaves)));
         let (fine, wide) = (fine?, wide?);
@@ -128,16 +128,17 @@ pub(crate) fn find(
         QualityTarget::Close(_) | QualityTarget::Loss(_) => {
             let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| {
                 Ok(Some(measure_views(widened(&widths, added))?)
-                    .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
+                    .filter(|&(_, found)| quality_target.is_met_by(found, required_psnr)))
             })?;
             best.map_or_else(|| measure_views(widened(&widths, OCTAVE_RANGE[0])), Ok)?
         }
     };
-    check_met(quality_target, asked, psnr)?;
+    check_met(quality_target, required_psnr, psnr)?;
     let names = Attributes::all().iter().map(|column| column.name().to_owned());
     let bounds = names.zip(widths).collect();
     let bits = BTreeMap::new();
-    let summary = ArchiveSummary { asked, psnr, level, loss, parts: None, bounds: Some(bounds), bits, measured };
+    let summary =
+        ArchiveSummary { asked: required_psnr, psnr, level, loss, parts: None, bounds: Some(bounds), bits, measured };
     Ok((ErrorBounds::new(widths), summary))
 }
 
@@ -233,8 +234,8 @@ impl BlockReader for RoundedReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &ReadPlan) {
-        self.reader.expect(wanted);
+    fn expect(&mut self, plan: &ReadPlan) {
+        self.reader.expect(plan);
     }
 
     fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {

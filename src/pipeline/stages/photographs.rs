@@ -1,5 +1,5 @@
-//! Stage `photographs`: fits the Gaussians, after their refinement toward renders of the original, to photographs of the
-//! training views.
+//! Stage `photographs`: fits the Gaussians, after their refinement toward renders of the original, to photographs of
+//! the training views.
 
 use std::path::PathBuf;
 
@@ -70,17 +70,17 @@ impl Stage for PhotographStage {
     }
 }
 
-/// Checks that the test views, on whose photographs the loss is measured, are not among the views `seen`, to whose
+/// Checks that the test views, on whose photographs the loss is measured, are not among the views `views`, to whose
 /// photographs the result is fitted.
 ///
 /// # Errors
-/// Fails if there are no test or validation views, or if one of them is among `seen`.
-fn check_test_views_are_apart(scene: &Scene, seen: &[FrameView]) -> Result<()> {
+/// Fails if there are no test or validation views, or if one of them is among `views`.
+fn check_test_views_are_apart(scene: &Scene, views: &[FrameView]) -> Result<()> {
     let test = match scene.rig.held_out_split() {
         Some(_) => select_views(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?,
-        None => seen.to_vec(),
+        None => views.to_vec(),
     };
-    match test.iter().any(|view| seen.contains(view)) {
+    match test.iter().any(|view| views.contains(view)) {
         false => Ok(()),
         true => Err(Error::usage(
             "--max-loss measures photographs of test views, and --toward photographs would fit to the same ones: expected \

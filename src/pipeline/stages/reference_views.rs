@@ -90,10 +90,10 @@ pub(crate) enum QualityTarget {
 
 impl QualityTarget {
     /// Returns the requirement for an archive of a result whose PSNR against the original is `level`, dB. `psnr` is the
-    /// value of the option `--archive-psnr`, if given; `asked` is the requirement that follows from the goal of the
-    /// run.
-    pub(crate) fn new(psnr: Option<f64>, asked: ArchiveTarget, level: f64) -> QualityTarget {
-        match (psnr, asked) {
+    /// value of the option `--archive-psnr`, if given; `archive_target` is the requirement that follows from the goal
+    /// of the run.
+    pub(crate) fn new(psnr: Option<f64>, archive_target: ArchiveTarget, level: f64) -> QualityTarget {
+        match (psnr, archive_target) {
             (_, ArchiveTarget::Bytes(most)) => QualityTarget::Bytes(most),
             (Some(psnr), _) => QualityTarget::Close(psnr),
             (None, ArchiveTarget::Loss(loss)) if loss > 0.0 => QualityTarget::Loss(loss),
@@ -103,12 +103,12 @@ impl QualityTarget {
     }
 
     /// Returns whether an archive meets the requirement. `psnr` is its PSNR against the result before quantization,
-    /// `loss` is the amount by which quantization lowered its PSNR against the original; both are in dB. `asked` is the
-    /// result of [`required_psnr`](QualityTarget::required_psnr).
-    pub(crate) fn is_met_by(self, [psnr, loss]: [f64; 2], asked: f64) -> bool {
+    /// `loss` is the amount by which quantization lowered its PSNR against the original; both are in dB.
+    /// `required_psnr` is the result of [`required_psnr`](QualityTarget::required_psnr).
+    pub(crate) fn is_met_by(self, [psnr, loss]: [f64; 2], required_psnr: f64) -> bool {
         match self {
             QualityTarget::Loss(most) => loss <= most,
-            QualityTarget::Close(_) | QualityTarget::Bytes(_) => psnr >= asked,
+            QualityTarget::Close(_) | QualityTarget::Bytes(_) => psnr >= required_psnr,
         }
     }
 
@@ -192,18 +192,19 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
 }
 
 /// Checks that the PSNR `found` of an archive against the result before quantization is at most [`MAX_SHORTFALL`] below
-/// the required PSNR `asked`, dB. An archive with a byte limit always passes.
+/// the required PSNR `required_psnr`, dB. An archive with a byte limit always passes.
 ///
 /// # Errors
-/// Fails if `found` is more than [`MAX_SHORTFALL`] below the smaller of `asked` and [`ENOUGH_PSNR`]. Then some values
-/// are so large that a quantization grid for them cannot represent the others.
-pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -> Result<()> {
-    let is_met = matches!(quality_target, QualityTarget::Bytes(_)) || found >= asked.min(ENOUGH_PSNR) - MAX_SHORTFALL;
+/// Fails if `found` is more than [`MAX_SHORTFALL`] below the smaller of `required_psnr` and [`ENOUGH_PSNR`]. Then some
+/// values are so large that a quantization grid for them cannot represent the others.
+pub(crate) fn check_met(quality_target: QualityTarget, required_psnr: f64, found: f64) -> Result<()> {
+    let is_met =
+        matches!(quality_target, QualityTarget::Bytes(_)) || found >= required_psnr.min(ENOUGH_PSNR) - MAX_SHORTFALL;
     match is_met {
         true => Ok(()),
         false => Err(Error::usage(format!(
-            "an archive cannot reach the requested PSNR against the result before quantization: expected {asked:.1} \
-             dB, found {}\n  \
+            "an archive cannot reach the requested PSNR against the result before quantization: \
+             expected {required_psnr:.1} dB, found {}\n  \
              some values may be far larger than all others: drop their Gaussians (--drop-ids), or write a .gseq",
             decibels_text(found, 1)
         ))),
