@@ -154,7 +154,7 @@ pub(super) struct Compress {
     #[arg(hide_possible_values = true)]
     pub(super) dry_run: Option<DryRun>,
     #[command(flatten)]
-    pub(super) kept: CacheArgs,
+    pub(super) cache_args: CacheArgs,
     /// Also write a page that plays the result beside the original, as `view` does [default: OUTPUT.html]
     #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, hide_short_help = true)]
     #[arg(conflicts_with_all = ["dry_run", "shard"])]
@@ -287,7 +287,7 @@ pub(super) struct Render {
     #[arg(short, long, value_name = "PATH", required_unless_present = "video", conflicts_with = "video")]
     pub(super) output: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) kept: CacheArgs,
+    pub(super) cache_args: CacheArgs,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
@@ -375,7 +375,7 @@ pub(super) struct ReportArgs {
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
     #[command(flatten)]
-    pub(super) kept: CacheArgs,
+    pub(super) cache_args: CacheArgs,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
@@ -392,7 +392,7 @@ pub(super) struct Evaluate {
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) kept: CacheArgs,
+    pub(super) cache_args: CacheArgs,
     #[command(flatten)]
     pub(super) earlier: Earlier,
     /// Print JSON
@@ -481,7 +481,7 @@ pub(super) struct Convert {
     #[arg(long, value_name = "1-19", value_parser = clap::value_parser!(i32).range(1..=19))]
     pub(super) level: Option<i32>,
     #[command(flatten)]
-    pub(super) kept: CacheArgs,
+    pub(super) cache_args: CacheArgs,
     /// Print the result as JSON
     #[arg(long)]
     pub(super) json: bool,

@@ -48,7 +48,7 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
     let is_flipped = args.input.trained.rot4d == Some(Rot4d::Flipped);
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
-    input.work = cache_request(args.kept);
+    input.work = cache_request(args.cache_args);
     if input.memory.tell == Verbosity::Nothing && !quiet {
         input.memory.tell = Verbosity::Time;
     }
@@ -150,7 +150,7 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
     let output = args.output.unwrap_or_default();
     let mut input = input_options(args.input, None, Some(&output), events);
     args.cameras.apply_to(&mut input);
-    input.work = cache_request(args.kept);
+    input.work = cache_request(args.cache_args);
     Ok(RenderOptions {
         input,
         selection,
@@ -169,7 +169,7 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
     };
     let mut input = input_options(args.input, None, Some(&output), events);
     args.cameras.apply_to(&mut input);
-    input.work = cache_request(args.kept);
+    input.work = cache_request(args.cache_args);
     VideoOptions {
         input,
         beside: args.beside,
@@ -386,8 +386,8 @@ fn view_set(named: SplitArg) -> ViewSet {
 }
 
 /// Returns the cache folder and the shard (part of a divided stage) that the arguments name; `None` without `--cache`.
-pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
-    kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
+pub(super) fn cache_request(cache_args: CacheArgs) -> Option<CacheRequest> {
+    cache_args.cache.map(|folder| CacheRequest { folder, part: cache_args.shard })
 }
 
 /// Returns the library's memory settings: the memory limit, and whether the memory plan is printed. If a limit is

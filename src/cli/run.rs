@@ -69,7 +69,7 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     let (json, dry_run) = (args.json, args.dry_run);
     let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Brief };
     let page_output = args.view.clone();
-    if dry_run == Some(DryRun::Stages) && args.kept.shard.is_some() {
+    if dry_run == Some(DryRun::Stages) && args.cache_args.shard.is_some() {
         return Err(Error::usage("--dry-run=stages lists what --shard divides: expected only one of them"));
     }
     let request = compress_options(args, quiet, events)?;
@@ -145,7 +145,7 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
     let as_json = args.json;
     let mut options =
         EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models, events) };
-    options.original.work = cache_request(args.kept);
+    options.original.work = cache_request(args.cache_args);
     let Some(found) = completed(evaluation::evaluate(&options)?)? else { return Ok(()) };
     tell_notes(&found.work_notes);
     print_as(as_json, || json_text(&found), || found.text())
@@ -169,7 +169,7 @@ fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
 fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(report::PAGE_FILE));
     let mut evaluate = evaluate_options(args.models, events);
-    evaluate.original.work = cache_request(args.kept);
+    evaluate.original.work = cache_request(args.cache_args);
     let options = ReportOptions {
         evaluate,
         more: args.more,
@@ -234,10 +234,10 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     let is_stored_differently = args.raw || args.level.is_some() || !args.max_error.is_empty();
     let storing = storage_precision(&args);
     let output = (!is_stdout).then_some(path.as_path());
-    let has_cache = args.kept.cache.is_some();
+    let has_cache = args.cache_args.cache.is_some();
     let cameras = Cameras { file: args.cameras, split: args.split };
     let mut input = input_options(args.input, Some(cameras), output, events);
-    input.work = cache_request(args.kept);
+    input.work = cache_request(args.cache_args);
     let kind = requested_kind(&args.format, &path)?;
     let is_container = !is_stdout && convert::is_container(&path, kind);
     let refuse =

@@ -31,7 +31,7 @@ use crate::TOOL;
 use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
 use crate::evaluation::results::{
-    Comparison, Evaluation, ImageScore, InsideOutsideMeans, OriginalAndCompressed, TruthComparison, ViewScores,
+    Comparison, Evaluation, ImageQuality, InsideOutsideMeans, OriginalAndCompressed, TruthComparison, ViewQuality,
 };
 use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::journal::records::RenderTime;
@@ -69,9 +69,9 @@ pub struct EvaluateOptions {
     pub max_views: Option<usize>,
     /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
     pub background: Option<[f32; 3]>,
-    /// Whether to compute FLIP, which takes longer than all other scores.
+    /// Whether to compute FLIP, which takes longer than all other measures.
     pub flip: bool,
-    /// Path of the CSV file for the scores of every view; `None`: no such file is written.
+    /// Path of the CSV file for the quality measures of every view; `None`: no such file is written.
     pub csv: Option<PathBuf>,
     /// Policy for a CSV file that already exists.
     pub overwrite: Replace,
@@ -144,7 +144,7 @@ pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstim
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
     let mut need = view_selection::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
-    need.fixed.push(("scores", size_of::<ViewScores>() as u64 * work.frame_views));
+    need.fixed.push(("scores", size_of::<ViewQuality>() as u64 * work.frame_views));
     need.fixed.push(("previous views", 3 * 12 * work.viewpoints * work.pixels));
     vec![need]
 }
@@ -234,10 +234,9 @@ impl ModelPair {
         Ok(())
     }
 
-    /// Compares all views and returns the evaluation. With a cache folder, several runs can share the work in shards
-    /// (ranges of the views):
-    /// - A run that is limited to one shard stores the scores of its views and ends with [`Error::ShardDone`].
-    /// - A run without such a limit computes the missing shards and joins the scores of all shards.
+    /// - A run that is limited to one shard stores the quality measures of its views and ends with
+    ///   [`Error::ShardDone`].
+    /// - A run without such a limit computes the missing shards and joins the quality measures of all shards.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -247,11 +246,9 @@ impl ModelPair {
         Ok(evaluation)
     }
 
-    /// Compares all views and returns the evaluation, as [`ModelPair::evaluate`] does, but as the first stage of a
-    /// longer run. It differs only if the run is limited to one shard (part of a divided stage):
-    /// - If the cache has the scores of all shards, it returns the evaluation, so that the run can go on to its next
-    ///   stage.
-    /// - If the cache lacks some, it ends with [`Error::ShardDone`] after it has stored the scores of its own shard.
+    /// - If the cache has the quality measures of all shards, it returns the evaluation, so that the run can go on to
+    /// - If the cache lacks some, it ends with [`Error::ShardDone`] after it has stored the quality measures of its own
+    ///   shard.
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -275,8 +272,8 @@ impl ModelPair {
     }
 
     /// Renders every view and returns the values of `observe` for all views, in order. Arguments of `observe`: the
-    /// frame state of the original, the camera, and the images of the view. Computes no scores. The work is done as the
-    /// stage `name`, which can be divided into shards (ranges of the views).
+    /// frame state of the original, the camera, and the images of the view. Computes no quality measures. The work is
+    /// done as the stage `name`, which can be divided into shards (ranges of the views).
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -319,17 +316,17 @@ impl ModelPair {
         })
     }
 
-    /// Builds the evaluation from `scores`, the scores of all views in order.
+    /// Builds the evaluation from `scores`, the quality measures of all views in order.
     fn evaluation(&self, scores: Vec<PairScores>) -> Result<Evaluation> {
         let times = &self.scene.source().info().times;
-        let view_scores = |(&FrameView { frame, view, .. }, (loss, truth))| ViewScores {
+        let view_scores = |(&FrameView { frame, view, .. }, (loss, truth))| ViewQuality {
             frame,
             time: times[frame],
             view,
             loss,
             truth,
         };
-        let scores: Vec<ViewScores> = self.views.iter().zip(scores).map(view_scores).collect();
+        let scores: Vec<ViewQuality> = self.views.iter().zip(scores).map(view_scores).collect();
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
                 folder: folder.to_string_lossy().into_owned(),
@@ -375,7 +372,7 @@ impl ModelPair {
         self.views.iter().map(|view| cone.is_outside(&rig.cameras[view.camera as usize])).collect()
     }
 
-    /// Returns the cache key of the scores. It contains the compressed model, the photographs, the views, the
+    /// Returns the cache key of the quality measures. It contains the compressed model, the photographs, the views, the
     /// background, and whether FLIP is computed. The cache adds the original and its cameras to the key.
     fn key(&self) -> Result<CacheKey> {
         if !self.scene.work.is_enabled() {
@@ -467,10 +464,10 @@ impl ModelPair {
         for_each_view_batch(subjects, &self.scene.rig.cameras, views, BatchLimits::one_frame(&self.scene.limits), visit)
     }
 
-    /// Renders and compares the views with the indices `range`. Returns the scores of these views, and the values of
-    /// `observe` (arguments as in [`ModelPair::observe`]) for them. The temporal error of a view needs the image of the
-    /// same view at an earlier frame. Therefore, for every view in `range`, its last image before `range` is first
-    /// rendered again.
+    /// Renders and compares the views with the indices `range`. Returns the quality measures of these views, and the
+    /// values of `observe` (arguments as in [`ModelPair::observe`]) for them. The temporal error of a view needs the
+    /// image of the same view at an earlier frame. Therefore, for every view in `range`, its last image before `range`
+    /// is first rendered again.
     fn scores<O: Send>(
         &self,
         range: Range<usize>,
@@ -546,9 +543,9 @@ fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<F
     last
 }
 
-/// Scores of one view at one frame. First: scores of the compressed model against the original. Second: scores of each
-/// model against the photograph, if there is one.
-type PairScores = (ImageScore, Option<OriginalAndCompressed<ImageScore>>);
+/// Quality measures of one view at one frame. First: quality measures of the compressed model against the original.
+/// Second: quality measures of each model against the photograph, if there is one.
+type PairScores = (ImageQuality, Option<OriginalAndCompressed<ImageQuality>>);
 
 /// Images of one view at one frame, all of the same size.
 pub struct RenderedViews {
@@ -561,8 +558,8 @@ pub struct RenderedViews {
 }
 
 impl RenderedViews {
-    /// Computes the scores of these images. `before`: images of the same view at the previous frame, for the temporal
-    /// error. `with_flip`: whether to compute FLIP.
+    /// Computes the quality measures of these images. `before`: images of the same view at the previous frame, for the
+    /// temporal error. `with_flip`: whether to compute FLIP.
     fn scores(&self, before: Option<&RenderedViews>, with_flip: bool) -> PairScores {
         let size = |rendered: &RenderedViews| (rendered.original.width, rendered.original.height);
         // The image size can change with the camera of a view. Then the view has no temporal error.
@@ -581,9 +578,9 @@ impl RenderedViews {
     }
 }
 
-/// Computes the scores of the image `a` against the image `b`. `before`: images that correspond to `a` and `b` at the
-/// previous frame of the view; if `None`, no temporal error is computed.
-fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> ImageScore {
+/// Computes the quality measures of the image `a` against the image `b`. `before`: images that correspond to `a` and
+/// `b` at the previous frame of the view; if `None`, no temporal error is computed.
+fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> ImageQuality {
     let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
-    ImageScore { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
+    ImageQuality { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
 }

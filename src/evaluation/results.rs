@@ -1,8 +1,8 @@
-//! Result of an evaluation as JSON, text and CSV: scores of every view and their means.
+//! Result of an evaluation as JSON, text and CSV: quality measures of every view and their means.
 //!
-//! Input: scores of every (frame, view) pair, sorted by frame, then view. Output: means over all views, per view and
-//! per frame, as JSON and text, and the scores themselves as CSV. Means are arithmetic and summed in the order of the
-//! views.
+//! Input: quality measures of every (frame, view) pair, sorted by frame, then view. Output: means over all views, per
+//! view and per frame, as JSON and text, and the quality measures themselves as CSV. Means are arithmetic and summed in
+//! the order of the views.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -27,9 +27,9 @@ pub struct OriginalAndCompressed<T> {
     pub compressed: T,
 }
 
-/// Scores of one image compared with another image.
+/// Quality measures (PSNR, SSIM, …) of one image compared with another image.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct ImageScore {
+pub struct ImageQuality {
     /// PSNR, dB ([`crate::metrics::psnr`]).
     pub psnr: f64,
     /// SSIM ([`crate::metrics::ssim`]).
@@ -41,26 +41,26 @@ pub struct ImageScore {
     pub flip: Option<f64>,
 }
 
-/// Scores of one view at one frame.
+/// Quality measures of one view at one frame.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct ViewScores {
+pub struct ViewQuality {
     /// Index of the frame in the sequence.
     pub frame: usize,
     /// Time stamp of the frame.
     pub time: f64,
     /// Number of the view in the data set.
     pub view: u32,
-    /// Scores of the compressed model against the original.
-    pub loss: ImageScore,
-    /// Scores of both models against the photograph; `None` without a photograph.
+    /// Quality measures of the compressed model against the original.
+    pub loss: ImageQuality,
+    /// Quality measures of both models against the photograph; `None` without a photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub truth: Option<OriginalAndCompressed<ImageScore>>,
+    pub truth: Option<OriginalAndCompressed<ImageQuality>>,
 }
 
-/// Mean scores over a set of views.
+/// Mean quality measures over a set of views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct QualityMeans {
-    /// Number of (frame, view) pairs over which scores are averaged.
+    /// Number of (frame, view) pairs over which quality measures are averaged.
     pub pairs: usize,
     /// Mean PSNR, dB.
     pub psnr: f64,
@@ -74,38 +74,38 @@ pub struct QualityMeans {
     pub flip: Option<f64>,
 }
 
-/// Mean scores over all frames of one view.
+/// Mean quality measures over all frames of one view.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ViewMeans {
     /// Number of the view in the data set.
     pub view: u32,
-    /// Means of the scores over the frames of this view.
+    /// Means of the quality measures over the frames of this view.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
 
-/// Mean scores over all views of one frame.
+/// Mean quality measures over all views of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FrameMeans {
     /// Index of the frame in the sequence.
     pub frame: usize,
     /// Time stamp of the frame.
     pub time: f64,
-    /// Means of the scores over the views of this frame. The temporal error of a view (its flicker) is between the
-    /// previous evaluated frame and this one.
+    /// Means of the quality measures over the views of this frame. The temporal error of a view (its flicker) is
+    /// between the previous evaluated frame and this one.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
 
-/// Mean scores of one set of images compared with another, such as renders with photographs.
+/// Mean quality measures of one set of images compared with another, such as renders with photographs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Comparison {
-    /// Mean scores over all views.
+    /// Mean quality measures over all views.
     #[serde(flatten)]
     pub overall: QualityMeans,
-    /// Mean scores over the frames of each view, by increasing view number.
+    /// Mean quality measures over the frames of each view, by increasing view number.
     pub per_view: Vec<ViewMeans>,
-    /// Mean scores over the views of each frame, by increasing frame.
+    /// Mean quality measures over the views of each frame, by increasing frame.
     pub per_frame: Vec<FrameMeans>,
 }
 
@@ -117,22 +117,23 @@ pub struct TruthComparison {
     /// Number of views on which the models are compared. Only [`QualityMeans::pairs`] of them have a photograph.
     #[serde(rename = "of")]
     pub compared_views: usize,
-    /// Mean scores of the compressed model against the photographs.
+    /// Mean quality measures of the compressed model against the photographs.
     #[serde(flatten)]
     pub compressed: Comparison,
-    /// Mean scores of the original model against the photographs, for comparison with the scores of the compressed
-    /// model.
+    /// Mean quality measures of the original model against the photographs, for comparison with the quality measures of
+    /// the compressed model.
     pub original: Comparison,
 }
 
-/// Mean scores of the compressed model against the original, separately for views whose cameras are inside and outside
-/// the rig of the training cameras (the cone of their directions, [`RigCone`](crate::scene::views_outside::RigCone)).
+/// Mean quality measures of the compressed model against the original, separately for views whose cameras are inside
+/// and outside the rig of the training cameras (the cone of their directions,
+/// [`RigCone`](crate::scene::views_outside::RigCone)).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct InsideOutsideMeans {
-    /// Mean scores over the views inside the rig: in the directions of the training cameras and between them. `None` if
-    /// there are no such views.
+    /// Mean quality measures over the views inside the rig: in the directions of the training cameras and between them.
+    /// `None` if there are no such views.
     pub inside: Option<QualityMeans>,
-    /// Mean scores over the views outside the rig of the training cameras.
+    /// Mean quality measures over the views outside the rig of the training cameras.
     pub outside: QualityMeans,
 }
 
@@ -153,14 +154,15 @@ pub struct Evaluation {
     pub cameras: CameraSummary,
     /// Background color: red, green, blue in [0, 1].
     pub background: [f32; 3],
-    /// Mean scores of the compressed model against the original.
+    /// Mean quality measures of the compressed model against the original.
     #[serde(flatten)]
     pub loss: Comparison,
-    /// Mean scores of the views inside the rig of the training cameras (in their directions and between them), and of
-    /// the views outside it; `None` if no view is outside, or if the cameras have no training views.
+    /// Mean quality measures of the views inside the rig of the training cameras (in their directions and between
+    /// them), and of the views outside it; `None` if no view is outside, or if the cameras have no training views.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rig_sides: Option<InsideOutsideMeans>,
-    /// Mean scores of both models against photographs; `None` without `--ground-truth` or without any photograph.
+    /// Mean quality measures of both models against photographs; `None` without `--ground-truth` or without any
+    /// photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground_truth: Option<TruthComparison>,
     /// Time of rendering one view with each model, milliseconds; `None` if it was not measured.
@@ -171,18 +173,18 @@ pub struct Evaluation {
     /// Notes for the user about the cache folder, which are not part of the result.
     #[serde(skip)]
     pub work_notes: Vec<String>,
-    /// Scores of every view, for the CSV file.
+    /// Quality measures of every view, for the CSV file.
     #[serde(skip)]
-    pub views: Vec<ViewScores>,
+    pub views: Vec<ViewQuality>,
 }
 
 impl QualityMeans {
-    /// Computes the means of `scores`. Without scores, `pairs` is 0, and PSNR and SSIM are NaN, which JSON writes as
-    /// null.
-    fn from_scores(scores: &[ImageScore]) -> QualityMeans {
+    /// Computes the means of `scores`. Without quality measures, `pairs` is 0, and PSNR and SSIM are NaN, which JSON
+    /// writes as null.
+    fn from_scores(scores: &[ImageQuality]) -> QualityMeans {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        let all = |value: fn(&ImageScore) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
-        let given = |value: fn(&ImageScore) -> Option<f64>| {
+        let all = |value: fn(&ImageQuality) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
+        let given = |value: fn(&ImageQuality) -> Option<f64>| {
             let values: Vec<f64> = scores.iter().filter_map(value).collect();
             (!values.is_empty()).then(|| mean(&values))
         };
@@ -197,19 +199,19 @@ impl QualityMeans {
 }
 
 impl Comparison {
-    /// Averages scores over all `view_scores`, over the frames of each view, and over the views of each frame.
-    /// `view_scores` must be sorted by frame. `score` returns the score to average, or `None` to leave out this view at
-    /// this frame. Returns `None` if no score is left.
+    /// Averages quality measures over all `view_scores`, over the frames of each view, and over the views of each
+    /// frame. `view_scores` must be sorted by frame. `score` returns the measures to average, or `None` to leave out
+    /// this view at this frame. Returns `None` if no measures are left.
     pub fn from_views(
-        view_scores: &[ViewScores],
-        score: impl Fn(&ViewScores) -> Option<ImageScore>,
+        view_scores: &[ViewQuality],
+        score: impl Fn(&ViewQuality) -> Option<ImageQuality>,
     ) -> Option<Comparison> {
-        let (view_scores, scores): (Vec<&ViewScores>, Vec<ImageScore>) =
+        let (view_scores, scores): (Vec<&ViewQuality>, Vec<ImageQuality>) =
             view_scores.iter().filter_map(|view| Some((view, score(view)?))).unzip();
         if scores.is_empty() {
             return None;
         }
-        let mut views: BTreeMap<u32, Vec<ImageScore>> = BTreeMap::new();
+        let mut views: BTreeMap<u32, Vec<ImageQuality>> = BTreeMap::new();
         for (view, &score) in view_scores.iter().zip(&scores) {
             views.entry(view.view).or_default().push(score);
         }
@@ -236,13 +238,13 @@ impl Comparison {
 }
 
 impl InsideOutsideMeans {
-    /// Averages the scores of the compressed model against the original, separately for views inside and outside the
-    /// rig of the training cameras. `is_outside[i]` states whether the view `views[i]` is outside. Returns `None` if no
-    /// view is outside.
-    pub fn from_views(views: &[ViewScores], is_outside: &[bool]) -> Option<InsideOutsideMeans> {
+    /// Averages the quality measures of the compressed model against the original, separately for views inside and
+    /// outside the rig of the training cameras. `is_outside[i]` states whether the view `views[i]` is outside. Returns
+    /// `None` if no view is outside.
+    pub fn from_views(views: &[ViewQuality], is_outside: &[bool]) -> Option<InsideOutsideMeans> {
         let side = |outside: bool| -> Option<QualityMeans> {
             let chosen = views.iter().zip(is_outside).filter(|&(_, &is)| is == outside);
-            let scores: Vec<ImageScore> = chosen.map(|(view, _)| view.loss).collect();
+            let scores: Vec<ImageQuality> = chosen.map(|(view, _)| view.loss).collect();
             (!scores.is_empty()).then(|| QualityMeans::from_scores(&scores))
         };
         Some(InsideOutsideMeans { inside: side(false), outside: side(true)? })
@@ -259,8 +261,8 @@ impl Evaluation {
         self
     }
 
-    /// Returns the evaluation as text for the terminal: both models, a table of mean scores, the worst view and the
-    /// worst frame, and the notes.
+    /// Returns the evaluation as text for the terminal: both models, a table of mean quality measures, the worst view
+    /// and the worst frame, and the notes.
     pub fn text(&self) -> String {
         let mut out = String::new();
         let OriginalAndCompressed { original, compressed } = self.count;
@@ -328,7 +330,8 @@ impl Evaluation {
         out
     }
 
-    /// Returns the scores as a CSV table with one row per (frame, view) pair. A missing value is an empty field.
+    /// Returns the quality measures as a CSV table with one row per (frame, view) pair. A missing value is an empty
+    /// field.
     pub fn csv(&self) -> String {
         let with_flip = self.loss.overall.flip.is_some();
         let compared = if self.ground_truth.is_some() { &["", "_gt", "_gt_original"][..] } else { &[""] };
@@ -337,7 +340,7 @@ impl Evaluation {
             names.extend(["psnr", "ssim", "temporal"].map(|score| format!("{score}{suffix}")));
             names.extend(with_flip.then(|| format!("flip{suffix}")));
         }
-        let row = |view: &ViewScores| {
+        let row = |view: &ViewQuality| {
             let mut row = vec![view.frame.to_string(), view.view.to_string(), view.time.to_string()];
             let truth = view.truth.map(|truth| [truth.compressed, truth.original]);
             for score in std::iter::once(view.loss).chain(truth.into_iter().flatten()) {
@@ -355,9 +358,9 @@ impl Evaluation {
 mod tests {
     use super::*;
 
-    fn view_scores(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> ViewScores {
-        let loss = ImageScore { psnr, ssim: psnr / 100.0, temporal, flip: None };
-        ViewScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
+    fn view_scores(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> ViewQuality {
+        let loss = ImageQuality { psnr, ssim: psnr / 100.0, temporal, flip: None };
+        ViewQuality { frame, time: frame as f64 / 4.0, view, loss, truth: None }
     }
 
     #[test]
@@ -378,7 +381,7 @@ mod tests {
         assert!(Comparison::from_views(&scores, |view| view.truth.map(|truth| truth.original)).is_none());
     }
 
-    fn evaluation(views: Vec<ViewScores>) -> Evaluation {
+    fn evaluation(views: Vec<ViewQuality>) -> Evaluation {
         let truth = Comparison::from_views(&views, |view| view.truth.map(|truth| truth.compressed));
         Evaluation {
             tool: String::new(),
@@ -426,8 +429,10 @@ mod tests {
         );
         for view in &mut views {
             view.loss.flip = Some(0.5);
-            view.truth =
-                Some(OriginalAndCompressed { original: ImageScore { flip: None, ..view.loss }, compressed: view.loss });
+            view.truth = Some(OriginalAndCompressed {
+                original: ImageQuality { flip: None, ..view.loss },
+                compressed: view.loss,
+            });
         }
         assert_eq!(
             evaluation(views).csv(),

@@ -1,4 +1,5 @@
-//! Comparison of one compressed model with the original: scores, renders and animations that the report page shows.
+//! Comparison of one compressed model with the original: image quality, renders and animations that the report page
+//! shows.
 
 use super::film::FilmPanel;
 use super::findings::{CompressedModelData, WorstPlaceImages};
@@ -7,7 +8,7 @@ use super::shown_images::ShownImage;
 
 /// Comparison of one compressed model with the original, for the report page.
 pub(super) struct Analysis {
-    /// Scores, failure modes and notes of the compressed model.
+    /// Image quality, failure modes and notes of the compressed model.
     pub(super) data: CompressedModelData,
     /// Files that `compress` wrote beside the compressed model.
     pub(super) run: RunFiles,

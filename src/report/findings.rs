@@ -7,7 +7,7 @@ use super::film::FilmPanel;
 use super::histogram::Histogram;
 use super::shown_images::ChosenRender;
 use crate::evaluation::precision::PrecisionDiagram;
-use crate::evaluation::results::{Evaluation, ViewScores};
+use crate::evaluation::results::{Evaluation, ViewQuality};
 use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::RenderTime;
 
@@ -44,7 +44,7 @@ pub struct CompressedModelData {
     /// each view number and for each frame.
     pub evaluation: Evaluation,
     /// Image quality (PSNR, SSIM and other measures) of every compared render.
-    pub view_scores: Vec<ViewScores>,
+    pub view_scores: Vec<ViewQuality>,
     /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,

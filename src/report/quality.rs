@@ -32,7 +32,8 @@ fn wrapped(charts: String) -> String {
 }
 
 /// Returns the HTML of a chart of one quality measure over the frames; empty for fewer than two frames. `value` returns
-/// the measure from the mean scores of a frame. `title`: caption of the chart. `label`: axis label of the measure.
+/// the measure from the mean quality measures of a frame. `title`: caption of the chart. `label`: axis label of the
+/// measure.
 fn by_frame(
     results: &[Analysis],
     names: &[String],

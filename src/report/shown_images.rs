@@ -1,8 +1,8 @@
 //! Choice of the renders that the page shows, and their images.
 //!
-//! Input: first the scores of all renders, from which some renders are chosen; then the chosen renders, which the
-//! caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_RENDERS_PER_PAGE`] renders of
-//! at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
+//! Input: first the quality measures of all renders, from which some renders are chosen; then the chosen renders, which
+//! the caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_RENDERS_PER_PAGE`]
+//! renders of at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
 
@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::evaluation::RenderedViews;
-use crate::evaluation::results::{Evaluation, ImageScore};
+use crate::evaluation::results::{Evaluation, ImageQuality};
 use crate::files::image::write::{ImageFormat, image_bytes};
 use crate::render::Image;
 
@@ -33,7 +33,7 @@ const UNCLIPPED: f64 = 0.999;
 /// range.
 const MAX_FACTOR: u32 = 64;
 
-/// Render that is chosen for the page, with its scores.
+/// Render that is chosen for the page, with its quality measures (PSNR, SSIM, …).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ChosenRender {
     /// Reasons why this render is shown on the page, such as "worst render".
@@ -82,7 +82,7 @@ pub fn choose_renders(evaluation: &Evaluation) -> Vec<ChosenRender> {
             continue;
         }
         let of = &scores[place];
-        let ImageScore { psnr, ssim, flip, .. } = of.loss;
+        let ImageQuality { psnr, ssim, flip, .. } = of.loss;
         chosen.push(ChosenRender {
             why: vec![why.to_owned()],
             place,
@@ -96,11 +96,11 @@ pub fn choose_renders(evaluation: &Evaluation) -> Vec<ChosenRender> {
     chosen
 }
 
-/// Returns the chosen renders `choices` with the scores of another compressed model of the same original. `evaluation`
-/// is the evaluation of this other model; the scores in `choices` are those of the first compressed model.
+/// Returns the chosen renders `choices` with the quality measures of another compressed model of the same original.
+/// `evaluation` is the evaluation of this other model; the scores in `choices` are those of the first compressed model.
 pub fn with_scores_from(evaluation: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
     let scored = |choice: &ChosenRender| {
-        let ImageScore { psnr, ssim, flip, .. } = evaluation.views[choice.place].loss;
+        let ImageQuality { psnr, ssim, flip, .. } = evaluation.views[choice.place].loss;
         ChosenRender { psnr, ssim, flip, ..choice.clone() }
     };
     choices.iter().map(scored).collect()
@@ -109,7 +109,7 @@ pub fn with_scores_from(evaluation: &Evaluation, choices: &[ChosenRender]) -> Ve
 /// Render that was chosen for the report, with the images that the report shows of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShownImage {
-    /// Chosen render, with its scores.
+    /// Chosen render, with its quality measures (PSNR, SSIM, …).
     pub choice: ChosenRender,
     /// Names and data URIs of the images: original, compressed model, difference and, if there is one, photograph.
     pub images: Vec<(&'static str, String)>,

@@ -63,7 +63,7 @@ pub(in crate::cli) struct PrecisionArgs {
     /// percentiles: resolution of the histogram from which percentiles are read. sums: f32 or f64 arithmetic. merging:
     /// radius, and number of passes. refining: number of steps and of target views. machine: threads and memory limit
     /// [default: all; for a long input all except the last three, which need complete runs]
-    #[arg(long, value_name = "KNOBS", value_delimiter = ',',
+    #[arg(long, value_name = "GROUPS", value_delimiter = ',',
           value_parser = clap::builder::PossibleValuesParser::new(Knob::ALL.map(Knob::name)))]
     pub(in crate::cli) knobs: Vec<String>,
     /// Fraction of the Gaussians that every setting keeps

@@ -53,7 +53,7 @@ pub(super) struct RigBuilder {
     /// Path of every camera file, and the index in `rig.views` of its first image.
     files: Vec<(PathBuf, usize)>,
     /// Number of images added so far from the camera file that is being read (the last of `files`).
-    taken: usize,
+    images_added: usize,
     /// Whether every image so far has a stated view number.
     are_views_stated: bool,
     /// Whether the images have time stamps; `None` before the first image.
@@ -70,7 +70,7 @@ impl RigBuilder {
             hasher: DefaultHashBuilder::default(),
             untimed: HashSet::new(),
             files: Vec::new(),
-            taken: 0,
+            images_added: 0,
             are_views_stated: true,
             is_timed: None,
         }
@@ -98,7 +98,7 @@ impl RigBuilder {
         let affordable = self.memory_counter.limit.bytes() / 4 / Rig::BYTES_PER_CAMERA;
         self.rig.cameras.reserve_exact(count.min(affordable.min(1 << 20) as usize));
         self.files.push((file.to_owned(), self.rig.views.len()));
-        self.taken = 0;
+        self.images_added = 0;
         Ok(())
     }
 
@@ -111,9 +111,9 @@ impl RigBuilder {
     /// If no file was begun.
     pub(super) fn add(&mut self, listed: ListedImage) -> Result<()> {
         let path = &self.files.last().expect("a file was begun").0;
-        let frame = self.taken;
+        let frame = self.images_added;
         let wrong = |expected: String, found: String| Error::input(path, place(Some(frame)), expected, found);
-        self.taken += 1;
+        self.images_added += 1;
         if let Err((expected, found)) = check(&listed.camera) {
             return Err(wrong(expected, found));
         }
