@@ -89,12 +89,18 @@ pub fn step_offsets(
     found
 }
 
-/// Inserts two entries into `found`, by tensor name: the quantization step offsets ([`importance_offsets`]) of the
-/// weights of `layer`, and those of its bias. `rows`: importance of each output of the layer, that is, how strongly an
-/// error of the output changes the result of the field. `columns`: mean square of each input of the layer.
-fn insert_offsets(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
-    found.insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
-    found.insert(format!("{}.bias", layer.name), importance_offsets(rows));
+/// Inserts two entries into `offsets_by_tensor`, by tensor name: the quantization step offsets ([`importance_offsets`])
+/// of the weights of `layer`, and those of its bias. `rows`: importance of each output of the layer, that is, how
+/// strongly an error of the output changes the result of the field. `columns`: mean square of each input of the layer.
+fn insert_offsets(
+    offsets_by_tensor: &mut BTreeMap<String, Vec<i8>>,
+    layer: &WeightLayer<'_>,
+    rows: &[f64],
+    columns: &[f64],
+) {
+    offsets_by_tensor
+        .insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
+    offsets_by_tensor.insert(format!("{}.bias", layer.name), importance_offsets(rows));
 }
 
 /// Returns one offset of a quantization step per entry of `importance`, in eighths of an octave. The offsets make steps

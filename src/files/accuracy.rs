@@ -142,10 +142,10 @@ impl CodingErrors {
         self.reduced_scales
     }
 
-    /// Compares the original attributes `wanted` of Gaussian `id` with its stored attributes `found` and records the
+    /// Compares the original attributes `expected` of Gaussian `id` with its stored attributes `actual` and records the
     /// errors. Ignores a Gaussian whose opacity is below 1/255 in both.
-    pub fn add(&mut self, id: usize, wanted: &RenderedAttributes, found: &RenderedAttributes) {
-        if wanted.opacity < MIN_OPACITY && found.opacity < MIN_OPACITY {
+    pub fn add(&mut self, id: usize, expected: &RenderedAttributes, actual: &RenderedAttributes) {
+        if expected.opacity < MIN_OPACITY && actual.opacity < MIN_OPACITY {
             return;
         }
         let scene_bound = MAX_ERROR_IN_SCENE_SIZES * self.scene;
@@ -153,19 +153,19 @@ impl CodingErrors {
             errors.into_iter().fold(0.0, |most: f64, x| if x > most || x.is_nan() { x } else { most })
         };
         let max_difference = |a: [f64; 3], b: [f64; 3]| largest([0, 1, 2].map(|k| (a[k] - b[k]).abs()));
-        let position_error = max_difference(wanted.position, found.position);
+        let position_error = max_difference(expected.position, actual.position);
         self.position = largest([self.position, position_error, 0.0]);
         // Clamp colors to [0, 1] before comparing them, as a screen does.
-        let [before, after] = [wanted, found].map(|drawn| drawn.color.map(|c| c.clamp(0.0, 1.0)));
+        let [before, after] = [expected, actual].map(|drawn| drawn.color.map(|c| c.clamp(0.0, 1.0)));
         self.check_error(
             id,
             "position",
             position_error,
-            scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * wanted.median_scale()),
+            scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * expected.median_scale()),
         );
-        let flat = FLAT_SCALE * (self.scene + distance(wanted.position, self.middle));
+        let flat = FLAT_SCALE * (self.scene + distance(expected.position, self.middle));
         let mut is_reduced = false;
-        for (before, after) in wanted.scale.into_iter().zip(found.scale) {
+        for (before, after) in expected.scale.into_iter().zip(actual.scale) {
             let (error, bound) = ((before - after).abs(), scene_bound.max(MAX_RELATIVE_SCALE_ERROR * before));
             // False for NaN.
             let is_flat = self.scene > 0.0 && flat <= after && after <= before;
@@ -176,7 +176,7 @@ impl CodingErrors {
             }
         }
         self.reduced_scales += usize::from(is_reduced);
-        self.check_error(id, "opacity", (wanted.opacity - found.opacity).abs(), MAX_COLOR_ERROR);
+        self.check_error(id, "opacity", (expected.opacity - actual.opacity).abs(), MAX_COLOR_ERROR);
         self.check_error(id, "color", max_difference(before, after), MAX_COLOR_ERROR);
     }
 

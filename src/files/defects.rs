@@ -43,12 +43,12 @@ impl Defects {
         Defects { rows, ..Defects::default() }
     }
 
-    /// Counts the defects `found` in row `row`. Each defect is given by its name, whether the row is dropped because of
-    /// it, and the reason.
-    pub fn add_row(&mut self, row: u32, found: &[(&str, bool, &str)]) {
-        self.defective += usize::from(!found.is_empty());
-        self.dropped += usize::from(found.iter().any(|&(_, dropped, _)| dropped));
-        for &(what, dropped, why) in found {
+    /// Counts the defects `row_defects` in row `row`. Each defect is given by its name, whether the row is dropped
+    /// because of it, and the reason.
+    pub fn add_row(&mut self, row: u32, row_defects: &[(&str, bool, &str)]) {
+        self.defective += usize::from(!row_defects.is_empty());
+        self.dropped += usize::from(row_defects.iter().any(|&(_, dropped, _)| dropped));
+        for &(what, dropped, why) in row_defects {
             let place = self.kinds.iter().position(|kind| kind.what == what).unwrap_or_else(|| {
                 let (what, why) = (what.to_owned(), why.to_owned());
                 self.kinds.push(DefectCount { what, dropped, why, rows: 0, first: Vec::new() });

@@ -50,9 +50,9 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
     Ok(bytes)
 }
 
-/// Checks that `found`, the type of the file at `path`, is that of a regular file. The error names the type found.
-fn check_regular(path: &Path, found: FileType) -> Result<()> {
-    let kind = match FileKind::from_type(found) {
+/// Checks that `file_type`, the type of the file at `path`, is that of a regular file. The error names the type found.
+fn check_regular(path: &Path, file_type: FileType) -> Result<()> {
+    let kind = match FileKind::from_type(file_type) {
         FileKind::File => return Ok(()),
         FileKind::Folder => return Err(Error::io("open", path)(io::ErrorKind::IsADirectory.into())),
         FileKind::Fifo => "a named pipe",

@@ -20,7 +20,7 @@ pub struct FrameReaders<'a> {
 }
 
 impl<'a> FrameReaders<'a> {
-    /// Opens readers for the attributes `columns` of the Gaussians `ids`. `wanted` names the frames that will be read.
+    /// Opens readers for the attributes `columns` of the Gaussians `ids`. `plan` names the frames that will be read.
     ///
     /// # Errors
     /// Fails if the source cannot be opened.
@@ -28,7 +28,7 @@ impl<'a> FrameReaders<'a> {
         source: &'a dyn FrameSource,
         ids: Ids<'_>,
         columns: Attributes,
-        wanted: &ReadPlan,
+        plan: &ReadPlan,
     ) -> Result<FrameReaders<'a>> {
         let count = ids.len();
         let readers = (0..count.div_ceil(GAUSSIANS_PER_BLOCK))
@@ -40,7 +40,7 @@ impl<'a> FrameReaders<'a> {
                     Ids::List(list) => Ids::List(&list[rows]),
                 };
                 let mut reader = source.open(ids)?;
-                reader.expect(wanted);
+                reader.expect(plan);
                 Ok(reader)
             })
             .collect::<Result<_>>()?;
@@ -82,17 +82,17 @@ impl BlockReader for FrameReaders<'_> {
     }
 }
 
-/// Opens a reader of the attributes `columns` of all Gaussians of a source. It stays open for all frames that `wanted`
+/// Opens a reader of the attributes `columns` of all Gaussians of a source. It stays open for all frames that `plan`
 /// names.
 ///
 /// Memory: that of [`FrameReaders`], or that of the source's own reader if it has one ([`FrameSource::open_all`]).
 pub(super) fn open_all<'a>(
     source: &'a dyn FrameSource,
     columns: Attributes,
-    wanted: &ReadPlan,
+    plan: &ReadPlan,
 ) -> Result<Box<dyn BlockReader + 'a>> {
-    match source.open_all(wanted) {
+    match source.open_all(plan) {
         Some(opened) => opened,
-        None => Ok(Box::new(FrameReaders::open(source, Ids::Range(0..source.info().count), columns, wanted)?)),
+        None => Ok(Box::new(FrameReaders::open(source, Ids::Range(0..source.info().count), columns, plan)?)),
     }
 }

@@ -45,9 +45,9 @@ const AVERAGED_FRACTION: f64 = 0.4;
 const AVERAGE_EVERY: usize = 4;
 
 impl RefineStage {
-    /// Prunes the model `compressed` in prune steps to `wanted` Gaussians and refines it. Returns the model with the
-    /// parameters that have the best quality on the validation views. Protected Gaussians (which the user keeps) are
-    /// not changed. `scored`: ranking and protected Gaussians. `journal` gets notes for the user, and the reason if
+    /// Prunes the model `compressed` in prune steps to `target_count` Gaussians and refines it. Returns the model with
+    /// the parameters that have the best quality on the validation views. Protected Gaussians (which the user keeps)
+    /// are not changed. `scored`: ranking and protected Gaussians. `journal` gets notes for the user, and the reason if
     /// nothing was done.
     ///
     /// # Errors
@@ -57,11 +57,11 @@ impl RefineStage {
         scene: &Scene,
         scored: &Scored,
         compressed: CompressedModel,
-        wanted: usize,
+        target_count: usize,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let count = compressed.len();
-        let steps = self.last_steps(wanted as f64 / scored.gaussian_count().max(1) as f64);
+        let steps = self.last_steps(target_count as f64 / scored.gaussian_count().max(1) as f64);
         if count == 0 || scene.schedule.pair_count() == 0 {
             journal.leave_out("refinement", "there are no Gaussians or no views");
             return Ok(compressed);
@@ -70,20 +70,20 @@ impl RefineStage {
             journal.leave_out("refinement", "no Gaussians were removed");
             return Ok(compressed);
         }
-        let key = scene.work.key(&(self.key(), &compressed, wanted, steps, &scored.protected));
+        let key = scene.work.key(&(self.key(), &compressed, target_count, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, count, scene.source(), |journal| {
                 let targets =
                     Targets::new(scene, self.target_views, self.stored_stride(scene.workload().pixels, count), false)?;
                 scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.split());
-                Ok((run.run_all(&compressed, wanted, steps, journal)?.0, wanted))
+                Ok((run.run_all(&compressed, target_count, steps, journal)?.0, target_count))
             })
         };
         journal.cached(&scene.work, NAME, key, run)
     }
 
-    /// Refines the model `compressed` to `wanted` Gaussians like [`RefineStage::run`], as part of the stage named
+    /// Refines the model `compressed` to `target_count` Gaussians like [`RefineStage::run`], as part of the stage named
     /// `stage`, with the target views `targets`. Returns only the mean PSNR, dB, of the refined model against the
     /// original on the validation views.
     ///
@@ -96,12 +96,12 @@ impl RefineStage {
         scored: &Scored,
         targets: &Targets,
         compressed: &CompressedModel,
-        wanted: usize,
+        target_count: usize,
     ) -> Result<f64> {
-        let steps = self.last_steps(wanted as f64 / scored.gaussian_count().max(1) as f64);
+        let steps = self.last_steps(target_count as f64 / scored.gaussian_count().max(1) as f64);
         let mut run = RefineRun::new(stage, self, scene, scored, targets, targets.split());
-        let key = run.key(compressed, wanted, wanted).extended_by(&steps);
-        let all = || Ok(run.run_all(compressed, wanted, steps, &mut Journal::default())?.1);
+        let key = run.key(compressed, target_count, target_count).extended_by(&steps);
+        let all = || Ok(run.run_all(compressed, target_count, steps, &mut Journal::default())?.1);
         scene.work.get_or_compute(&format!("{stage}-size"), key, all)
     }
 }
@@ -130,10 +130,10 @@ impl EpochSampler {
         self.views[self.at - 1]
     }
 
-    /// Skips views of the random order until `taken` views have been taken since the beginning. Used to continue an
+    /// Skips views of the random order until `steps` views have been taken since the beginning. Used to continue an
     /// interrupted run.
-    fn skip_to(&mut self, taken: usize) {
-        while self.taken < taken {
+    fn skip_to(&mut self, steps: usize) {
+        while self.taken < steps {
             self.next();
         }
     }
@@ -261,36 +261,36 @@ impl<'a> RefineRun<'a> {
         OptimizerState::new(self.scene, result, self.targets, self.refine.step_params(), fixed)
     }
 
-    /// Returns the cache key of a refined model that is made from `compressed`. `size`: number of Gaussians of this
-    /// model, which later prune steps may reduce further. `wanted`: number of Gaussians after the last of these prune
-    /// steps, at most `size`. The number of optimization steps depends on `wanted`, so it is part of the key.
-    fn key(&self, compressed: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
-        self.key.extended_by(&(compressed, size, wanted, self.sampler.taken))
+    /// Returns the cache key of a refined model that is made from `compressed`. `size`: its number of Gaussians.
+    /// `target_count`: number of Gaussians after later prune steps, at most `size`; the key contains it because the
+    /// number of optimization steps depends on it.
+    fn key(&self, compressed: &CompressedModel, size: usize, target_count: usize) -> CacheKey {
+        self.key.extended_by(&(compressed, size, target_count, self.sampler.taken))
     }
 
     fn timer(&self, key: CacheKey) -> CheckpointTimer {
         CheckpointTimer { key, phase: 0, saved_at: Instant::now(), interval: CHECKPOINT_INTERVAL[0] }
     }
 
-    /// Prunes `compressed` to `wanted` Gaussians in prune steps and then runs `steps` final optimization steps. Returns
-    /// the refined model, and the mean PSNR in dB of its renders of the validation views, compared with the original.
+    /// Prunes `compressed` to `target_count` Gaussians in prune steps and then runs `steps` final optimization steps.
+    /// Returns the refined model, and the mean PSNR, dB, of its renders of the validation views against the original.
     fn run_all(
         &mut self,
         compressed: &CompressedModel,
-        wanted: usize,
+        target_count: usize,
         steps: usize,
         journal: &mut Journal,
     ) -> Result<(CompressedModel, f64)> {
-        let mut timer = self.timer(self.key(compressed, wanted, wanted).extended_by(&steps));
+        let mut timer = self.timer(self.key(compressed, target_count, target_count).extended_by(&steps));
         let result = self.scene.input.compressed_frames(compressed)?;
         let mut optimizer = self.start_optimizer(compressed, &*result)?;
-        let prune_counts = prune_counts(compressed.len(), wanted);
+        let prune_counts = prune_counts(compressed.len(), target_count);
         let prune_steps_total: usize =
-            prune_counts.windows(2).map(|pair| self.refine.steps_before(pair[0], wanted)).sum();
+            prune_counts.windows(2).map(|pair| self.refine.steps_before(pair[0], target_count)).sum();
         self.set_total_steps(prune_steps_total + steps + self.steps_along_time(steps));
         let mut left = compressed.clone();
         for pair in prune_counts.windows(2) {
-            let steps = self.refine.steps_before(pair[0], wanted);
+            let steps = self.refine.steps_before(pair[0], target_count);
             left = left.pick(&self.prune_step(&mut optimizer, &mut timer, steps, pair[1])?);
         }
         let BestState { delta, trajectory, best, .. } = self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
@@ -299,19 +299,19 @@ impl<'a> RefineRun<'a> {
     }
 
     /// Makes one prune step: runs optimization steps, then removes all but `size` Gaussians of `compressed`. Returns
-    /// the pruned model. `wanted`: number of Gaussians that remain after the last prune step.
+    /// the pruned model. `target_count`: number of Gaussians that remain after the last prune step.
     pub(crate) fn prune_to(
         &mut self,
         compressed: &CompressedModel,
         size: usize,
-        wanted: usize,
+        target_count: usize,
     ) -> Result<CompressedModel> {
-        let key = self.key(compressed, size, wanted);
+        let key = self.key(compressed, size, target_count);
         let (left, taken) = self.scene.work.get_or_compute(&format!("{}-cut", self.stage), key, || {
             let mut timer = self.timer(key);
             let result = self.scene.input.compressed_frames(compressed)?;
             let mut optimizer = self.start_optimizer(compressed, &*result)?;
-            let steps = self.refine.steps_before(compressed.len(), wanted);
+            let steps = self.refine.steps_before(compressed.len(), target_count);
             self.set_total_steps(steps);
             let mut left = compressed.pick(&self.prune_step(&mut optimizer, &mut timer, steps, size)?);
             left.delta = left.delta.plus(optimizer.change());

@@ -137,9 +137,9 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
 }
 
 /// Compares the compressed model that `options` name with the original, and returns everything that the page shows of
-/// this compressed model. `wanted` lists the renders to show; if it is `None`, this function chooses them.
+/// this compressed model. `chosen_renders` lists the renders to show; if it is `None`, this function chooses them.
 /// `render_time` states whether to measure render times.
-fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
+fn analyze(options: &EvaluateOptions, chosen_renders: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
     let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
     let (count, frames) = (info.count, info.times.len());
@@ -184,7 +184,8 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         .zip(members)
         .map(|(&kind, members)| assess_failure_mode(kind, members, &seen, &names))
         .collect();
-    let choices = wanted.map_or_else(|| choose_renders(&evaluation), |wanted| with_scores_from(&evaluation, wanted));
+    let choices =
+        chosen_renders.map_or_else(|| choose_renders(&evaluation), |chosen| with_scores_from(&evaluation, chosen));
     let (shown, close) = show_again(&side, &choices, &failure_modes, &kinds)?;
     let films = film::render_films(&side, &shown)?;
     let render_time = if render_time { side.render_time()? } else { None };

@@ -22,12 +22,15 @@ impl Photographs {
     /// all photographs, is named in error messages.
     ///
     /// # Errors
-    /// Fails if two views have the same photograph, or if an item of `found` is an error.
-    fn from_files(folder: &Path, found: impl Iterator<Item = Result<(FrameView, PathBuf)>>) -> Result<Photographs> {
+    /// Fails if two views have the same photograph, or if an item of `photographs` is an error.
+    fn from_files(
+        folder: &Path,
+        photographs: impl Iterator<Item = Result<(FrameView, PathBuf)>>,
+    ) -> Result<Photographs> {
         let mut files = HashMap::new();
         let mut view_of_file: HashMap<PathBuf, FrameView> = HashMap::new();
-        for found in found {
-            let (view, file) = found?;
+        for photograph in photographs {
+            let (view, file) = photograph?;
             // Cameras with time stamps may give all their views the same file name.
             if let Some(other) = view_of_file.insert(file.clone(), view) {
                 let found =

@@ -107,7 +107,7 @@ impl SlowLinker {
     ///
     /// - `candidates`: all possible links of the round as (cost, track, Gaussian).
     /// - `gaussian_of`: the Gaussian of every linked track.
-    /// - `taken`: the track of every linked Gaussian.
+    /// - `track_of`: the track of every linked Gaussian.
     /// - `cost`: returns the cost (distance and difference in appearance) of the link between a track and a Gaussian.
     /// - `are_duplicates`: decides whether a possible link between a track and a Gaussian is ignored because
     ///   near-duplicates cannot be told apart. Arguments: this track, this Gaussian, the Gaussian that the track is
@@ -115,7 +115,7 @@ impl SlowLinker {
     fn probabilities(
         candidates: &[(f64, usize, usize)],
         gaussian_of: &BTreeMap<usize, usize>,
-        taken: &BTreeMap<usize, usize>,
+        track_of: &BTreeMap<usize, usize>,
         cost: impl Fn(usize, usize) -> f64,
         are_duplicates: impl Fn(usize, usize, Option<usize>, Option<usize>) -> bool,
     ) -> Vec<(f64, usize)> {
@@ -127,10 +127,10 @@ impl SlowLinker {
         let probability = |(&a, &b): (&usize, &usize)| {
             let mut most = 0f64;
             for &&(candidate_cost, c, d) in rivals.iter().filter(|(_, c, d)| *c == a || *d == b) {
-                if are_duplicates(c, d, linked.get(&c).copied(), taken.get(&d).copied()) {
+                if are_duplicates(c, d, linked.get(&c).copied(), track_of.get(&d).copied()) {
                     continue;
                 }
-                let (now, swapped) = match (linked.get(&c), taken.get(&d)) {
+                let (now, swapped) = match (linked.get(&c), track_of.get(&d)) {
                     (Some(&own), Some(&other)) => {
                         (cost(c, own) + cost(other, d), candidate_cost + cost(other, own).min(1.0))
                     }

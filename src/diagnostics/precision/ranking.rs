@@ -128,13 +128,13 @@ impl Bench<'_> {
     /// - `name`: name of the varied parameter
     /// - third argument: value and step size of the parameter in the finest setting; contributions of the Gaussians,
     ///   measured with this setting; cost (time and memory) of measuring them
-    /// - `own`: value of the parameter in the recipe
+    /// - `recipe_value`: value of the parameter in the recipe
     fn pass_curve(
         &self,
         name: &str,
         variants: Vec<RankingVariant>,
         ((value, step), finest, cost): ((f64, f64), &VisibleContribution, &Cost),
-        own: Option<f64>,
+        recipe_value: Option<f64>,
     ) -> Result<PrecisionCurve> {
         let best = self.scored(Some(finest.clone()))?;
         let measured =
@@ -157,7 +157,7 @@ impl Bench<'_> {
             }
         }
         tried.push(measured(value, step, finest.clone(), cost.clone())?);
-        self.curve(name, "all pixels of all these views", tried, own, &[])
+        self.curve(name, "all pixels of all these views", tried, recipe_value, &[])
     }
 
     /// Computes the scores of all Gaussians and selects the Gaussians to keep. The scores follow from the statistics of
@@ -266,14 +266,14 @@ impl Bench<'_> {
     /// and how renders of its kept Gaussians differ from renders of the whole model.
     /// - `name`: name of the varied parameter
     /// - `against`: description of the finest setting, for the user
-    /// - `own`: value of the parameter in the recipe
+    /// - `recipe_value`: value of the parameter in the recipe
     /// - `expected`: pairs of the name of an error and the order of convergence that theory predicts for it
     fn curve(
         &self,
         name: &str,
         against: &str,
         tried: Vec<TriedRanking>,
-        own: Option<f64>,
+        recipe_value: Option<f64>,
         expected: &[(&str, f64)],
     ) -> Result<PrecisionCurve> {
         let mut marks = Vec::with_capacity(tried.len());
@@ -294,7 +294,7 @@ impl Bench<'_> {
             marks.push(PrecisionSetting { value, step, cost, errors, psnr: Some(found.psnr) });
             self.advance();
         }
-        Ok(PrecisionCurve::new(name, against, marks, own, expected))
+        Ok(PrecisionCurve::new(name, against, marks, recipe_value, expected))
     }
 }
 

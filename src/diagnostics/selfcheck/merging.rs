@@ -145,10 +145,10 @@ fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     }
 }
 
-/// Compares mean and covariance of `found` with those of the mixture `parts` and adds the errors to `worst`. The
+/// Compares mean and covariance of `actual` with those of the mixture `parts` and adds the errors to `worst`. The
 /// expected covariance Σ is formed as a matrix, by the textbook formula. Errors of the covariance are relative to the
 /// largest entry of Σ, errors of the mean to the square root of this entry.
-fn compare_moments(found: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut LargestError) {
+fn compare_moments(actual: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut LargestError) {
     let covariance = |rotation: DQuat, scales: DVec3| {
         let axes = DMat3::from_quat(rotation);
         axes * DMat3::from_diagonal(scales * scales) * axes.transpose()
@@ -159,7 +159,7 @@ fn compare_moments(found: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut La
         |part: &WeightedGaussian| (covariance(part.rotation, part.scales) + outer(part.position - mean)) * part.weight;
     let expected = parts.iter().map(spread).fold(DMat3::ZERO, |sum, part| sum + part).to_cols_array();
     let largest = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
-    (0..3).for_each(|axis| worst.near(found.mean[axis], mean[axis], largest.sqrt()));
-    let got = covariance(found.rotation, found.scales).to_cols_array();
+    (0..3).for_each(|axis| worst.near(actual.mean[axis], mean[axis], largest.sqrt()));
+    let got = covariance(actual.rotation, actual.scales).to_cols_array();
     got.iter().zip(expected).for_each(|(&got, expected)| worst.near(got, expected, largest));
 }

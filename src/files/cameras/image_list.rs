@@ -39,12 +39,12 @@ pub(super) fn outline(file: &Path) -> Result<SmallValue> {
     read(file, &ParseAbort::default(), Keep { wanted: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
 }
 
-/// Reads the values of the keys `wanted` from a small JSON file.
+/// Reads the values of the keys `keys` from a small JSON file.
 ///
 /// # Errors
 /// Fails if the file is not valid JSON.
-pub(super) fn read_keys(file: &Path, wanted: &[&str]) -> Result<SmallValue> {
-    read(file, &ParseAbort::default(), Keep { wanted, elements: MAX_ELEMENTS })
+pub(super) fn read_keys(file: &Path, keys: &[&str]) -> Result<SmallValue> {
+    read(file, &ParseAbort::default(), Keep { wanted: keys, elements: MAX_ELEMENTS })
 }
 
 /// Calls `take` with the index and the content of every element of the list under `key`. If `key` is `None`, the list

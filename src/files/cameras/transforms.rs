@@ -103,22 +103,23 @@ fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> R
     })
 }
 
-/// Builds an image of the split `split` from its own keys `own` and the keys `shared` by all images of the file.
+/// Builds an image of the split `split` from its own keys `image_fields` and the keys `shared` by all images of the
+/// file.
 fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,
-    own: CameraFields<'_>,
+    image_fields: CameraFields<'_>,
     split: Split,
     options: &CameraOptions,
 ) -> Result<ListedImage> {
-    let name = own.optional_text("file_path")?;
+    let name = image_fields.optional_text("file_path")?;
     let image = name.map(|name| resolve(file, name));
-    let size = size(shared, own, image.as_deref(), options)?;
-    let intrinsics = intrinsics(shared, own, size)?;
-    let (rotation, center) = own.pose("transform_matrix")?;
+    let size = size(shared, image_fields, image.as_deref(), options)?;
+    let intrinsics = intrinsics(shared, image_fields, size)?;
+    let (rotation, center) = image_fields.pose("transform_matrix")?;
     Ok(ListedImage {
         camera: from_camera_to_world(size, intrinsics, rotation * OPENGL_TO_OPENCV, center),
-        time: own.optional_number("time")?,
+        time: image_fields.optional_number("time")?,
         split,
         image,
         view: name.and_then(view_in_name),
@@ -126,31 +127,37 @@ fn listed_image(
 }
 
 /// Returns the width and height of an image in pixels: from the camera file, else from the image file, else from the
-/// options. In the camera file, the keys `own` of the image take precedence over the keys `shared` by all images. Fails
-/// if no size is found.
+/// options. In the camera file, the keys `image_fields` of the image take precedence over the keys `shared` by all
+/// images. Fails if no size is found.
 fn size(
     shared: CameraFields<'_>,
-    own: CameraFields<'_>,
+    image_fields: CameraFields<'_>,
     image: Option<&Path>,
     options: &CameraOptions,
 ) -> Result<(u32, u32)> {
-    let side =
-        |key| own.optional_side(key).and_then(|side| side.map_or_else(|| shared.optional_side(key), |s| Ok(Some(s))));
+    let side = |key| {
+        image_fields.optional_side(key).and_then(|side| side.map_or_else(|| shared.optional_side(key), |s| Ok(Some(s))))
+    };
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
         return Ok((width, height));
     }
     // Ignore a missing or unreadable image, because the options may give the size.
     image.and_then(measure).or(options.size).ok_or_else(|| {
         let tried = image.map_or_else(String::new, |image| format!(", or the image {}", image.shown()));
-        own.wrong("w", format!("the image size as w and h{tried}"))
+        image_fields
+            .wrong("w", format!("the image size as w and h{tried}"))
             .hint("give --resolution WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")
     })
 }
 
 /// Returns the focal lengths and the principal point fx, fy, cx, cy in pixels, for an image of the given size. The keys
-/// `own` of the image take precedence over the keys `shared` by all images. Fails if there is no horizontal focal
-/// length.
-fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
+/// `image_fields` of the image take precedence over the keys `shared` by all images. Fails if there is no horizontal
+/// focal length.
+fn intrinsics(
+    shared: CameraFields<'_>,
+    image_fields: CameraFields<'_>,
+    (width, height): (u32, u32),
+) -> Result<[f64; 4]> {
     let (width, height) = (f64::from(width), f64::from(height));
     let focal = |fields: CameraFields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
         if let Some(focal) = fields.optional_number(pixels)? {
@@ -160,7 +167,7 @@ fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): 
     };
     let mut fx = None;
     let mut fy = None;
-    for fields in [own, shared] {
+    for fields in [image_fields, shared] {
         if fx.is_none() {
             fx = focal(fields, "fl_x", "camera_angle_x", width)?;
             // Take the vertical focal length from the same object as the horizontal one: the image, or the file.
@@ -169,7 +176,7 @@ fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): 
     }
     let fx = fx.ok_or_else(|| shared.wrong("camera_angle_x", "camera_angle_x or fl_x, here or in every frame"))?;
     let middle = |key, middle| -> Result<f64> {
-        Ok(own.optional_number(key)?.or(shared.optional_number(key)?).unwrap_or(middle))
+        Ok(image_fields.optional_number(key)?.or(shared.optional_number(key)?).unwrap_or(middle))
     };
     Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
 }

@@ -99,17 +99,17 @@ impl PythonValue {
         }
     }
 
-    /// Adds the storages (blocks of values) of all tensors in this value to `found`, as (number, bytes).
-    fn storages(&self, found: &mut Vec<(usize, Vec<u8>)>) {
+    /// Adds the storages (blocks of values) of all tensors in this value to `storages_out`, as (number, bytes).
+    fn storages(&self, storages_out: &mut Vec<(usize, Vec<u8>)>) {
         match self {
             PythonValue::Tensor(tensor) | PythonValue::Parameter(tensor) => {
-                found.push((tensor.storage, tensor.bytes.clone()))
+                storages_out.push((tensor.storage, tensor.bytes.clone()))
             }
             PythonValue::Tuple(elements) | PythonValue::List(elements) => {
-                elements.iter().for_each(|element| element.storages(found))
+                elements.iter().for_each(|element| element.storages(storages_out))
             }
             PythonValue::Dict(items) | PythonValue::Ordered(items) => {
-                items.iter().for_each(|(_, value)| value.storages(found))
+                items.iter().for_each(|(_, value)| value.storages(storages_out))
             }
             _ => (),
         }

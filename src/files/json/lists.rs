@@ -70,17 +70,17 @@ pub(crate) fn each_element_from(
 }
 
 /// Calls `each` with the key and value of every entry of the JSON object in the file at `path`, in order. Does not call
-/// it if the document is not an object. Of each value only the keys `wanted` are kept.
+/// it if the document is not an object. Of each value only the keys `keys` are kept.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
 pub(crate) fn each_entry(
     path: &Path,
-    wanted: &[&str],
+    keys: &[&str],
     mut each: impl FnMut(&str, SmallValue) -> Result<()>,
 ) -> Result<()> {
     let stopped = ParseAbort::default();
-    read(path, &stopped, Entries { wanted, each: &mut each, stopped: &stopped })
+    read(path, &stopped, Entries { wanted: keys, each: &mut each, stopped: &stopped })
 }
 
 /// State that the serde visitors of a document share while selected lists are read: the selection `ask`, the callback

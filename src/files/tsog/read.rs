@@ -110,23 +110,23 @@ fn frame_count(entry: &TimelineEntry, path: &Path) -> Result<usize> {
 }
 
 /// Reads when each Gaussian is visible: decodes the two images of the timeline `entry` from `files`. Writes the result
-/// to `own`, the format-specific parameters: the index of the one frame in which the Gaussian is seen, or the center
-/// and deviation of its time window. `timeline` says which of the two the file has.
+/// to `format_specific`, the format-specific parameters: the index of the one frame in which the Gaussian is seen, or
+/// the center and deviation of its time window. `timeline` says which of the two the file has.
 fn read_timeline(
     entry: &TimelineEntry,
     timeline: Timeline,
     files: &mut Files,
     (path, memory): (&Path, ReadLimit),
-    own: &mut AttributeValues,
+    format_specific: &mut AttributeValues,
 ) -> Result<()> {
-    let count = own.len();
+    let count = format_specific.len();
     let mut image = |name: &str| files.image_of_gaussians(path, name, count, memory);
     let (low, high) = (image(&entry.files[0])?, image(&entry.files[1])?);
     let codes = (0..count).map(|i| decode_16_bit(low.pixels[i], high.pixels[i]));
     if let Timeline::Frames(frames) = timeline {
         let delta = codes_per_frame(frames);
         let frame = codes.map(|[code, ..]| (usize::from(code) / delta).min(frames - 1) as f32);
-        own.plane_mut(0).iter_mut().zip(frame).for_each(|(to, frame)| *to = frame);
+        format_specific.plane_mut(0).iter_mut().zip(frame).for_each(|(to, frame)| *to = frame);
         return Ok(());
     }
     let range = |name: &str, values: Option<[f64; 2]>| {
@@ -139,22 +139,22 @@ fn read_timeline(
     let ([c0, s0], [c1, s1]) = (range("mins", entry.mins)?, range("maxs", entry.maxs)?);
     let range = checked(Range3 { mins: [c0, s0, 0.0], maxs: [c1, s1, 0.0] }, path, "timeline")?;
     for (i, code) in codes.enumerate() {
-        own.plane_mut(TIME_CENTER)[i] = range.decode(0, code[0]) as f32;
-        own.plane_mut(LOG_TIME_DEVIATION)[i] = range.decode(1, code[1]).ln() as f32;
+        format_specific.plane_mut(TIME_CENTER)[i] = range.decode(0, code[0]) as f32;
+        format_specific.plane_mut(LOG_TIME_DEVIATION)[i] = range.decode(1, code[1]).ln() as f32;
     }
     Ok(())
 }
 
 /// Reads the velocity of each Gaussian: decodes the one or two images that `entry` describes from `files`. Writes the
-/// velocities to `own`, the format-specific parameters of the Gaussians. `path` names the file in errors, and `memory`
-/// limits the size of the images.
+/// velocities to `format_specific`, the format-specific parameters of the Gaussians. `path` names the file in errors,
+/// and `memory` limits the size of the images.
 fn read_velocities(
     entry: &Velocity,
     files: &mut Files,
     (path, memory): (&Path, ReadLimit),
-    own: &mut AttributeValues,
+    format_specific: &mut AttributeValues,
 ) -> Result<()> {
-    let count = own.len();
+    let count = format_specific.len();
     let mut image = |name: &str| files.image_of_gaussians(path, name, count, memory);
     let range = checked(Range3 { mins: entry.mins[0], maxs: entry.maxs[0] }, path, "temporal, means")?;
     let images = match &entry.files[..] {
@@ -171,7 +171,7 @@ fn read_velocities(
             (one, None) => [0, 1, 2].map(|c| 257 * u16::from(one.pixels[i][c])),
             (low, Some(high)) => decode_16_bit(low.pixels[i], high.pixels[i]),
         };
-        (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[i] = range.decode(c, codes[c]) as f32);
+        (0..3).for_each(|c| format_specific.plane_mut(VELOCITY + c)[i] = range.decode(c, codes[c]) as f32);
     }
     Ok(())
 }

@@ -110,38 +110,38 @@ fn position(state: &Gaussians, row: usize) -> DVec3 {
 }
 
 /// Returns for each Gaussian of `raw` (stored parameters) the sum over `frames` of the squared distance between the
-/// position that `model` computes and a target position, in scene units squared. `wanted(k, row)` returns the target
+/// position that `model` computes and a target position, in scene units squared. `targets(k, row)` returns the target
 /// position of the Gaussian in row `row` at frame `frames[k]`.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
     frames: &[usize],
-    wanted: impl Fn(usize, usize) -> DVec3,
+    targets: impl Fn(usize, usize) -> DVec3,
 ) -> Result<Vec<f64>> {
     let (mut off, mut state) = (vec![0.0; raw.len()], Gaussians::zeros(0, 0));
     let gaussians = model.with_params(raw);
     for (k, &frame) in frames.iter().enumerate() {
         gaussians.state(frame, Attributes::POSITION, &mut state)?;
         for (row, off) in off.iter_mut().enumerate() {
-            *off += (position(&state, row) - wanted(k, row)).length_squared();
+            *off += (position(&state, row) - targets(k, row)).length_squared();
         }
     }
     Ok(off)
 }
 
 /// Returns the stored parameters `raw` of proxies (Gaussians that replace merged ones) with other positions. The
-/// position of every proxy is moved by one Gauss-Newton step, which brings its path nearer to its target. `wanted`
+/// position of every proxy is moved by one Gauss-Newton step, which brings its path nearer to its target. `targets`
 /// holds the target states of all proxies, one entry for each of `frames`.
 fn gauss_newton_step<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
     frames: &[usize],
-    wanted: &[Gaussians],
+    targets: &[Gaussians],
 ) -> Result<StoredParams> {
     let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
     let mut state = Gaussians::zeros(0, 0);
     let gaussians = model.with_params(raw);
-    for (&frame, wanted) in frames.iter().zip(wanted) {
+    for (&frame, target) in frames.iter().zip(targets) {
         gaussians.state(frame, Attributes::POSITION, &mut state)?;
         let slopes = gaussians.jacobian(frame, Attributes::POSITION)?;
         let slopes = slopes.derivative(Attributes::POSITION);
@@ -149,7 +149,7 @@ fn gauss_newton_step<L: NetworkMotionModel>(
             // Plane 3·i + j holds the derivative of component i by component j, so reading columns gives the transpose.
             let transposed = DMat3::from_cols_array(&slopes.row::<9>(row).map(f64::from));
             *matrix += transposed * transposed.transpose();
-            *vector += transposed * (position(wanted, row) - position(&state, row));
+            *vector += transposed * (position(target, row) - position(&state, row));
         }
     }
     let mut better = raw.clone();
@@ -231,14 +231,14 @@ struct StateDifference {
 
 impl StateDifference {
     /// Adds one frame to the sums of one proxy (Gaussian that replaces a merged cluster). Its target state at this
-    /// frame is row `row` of `wanted`, its actual state is row `row` of `state`.
-    fn add_frame(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
-        let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
+    /// frame is row `row` of `target`, its actual state is row `row` of `state`.
+    fn add_frame(&mut self, target: &Gaussians, state: &Gaussians, row: usize) {
+        let [to, from] = [target, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
         for c in 0..3 {
             self.scale[c] += to[c].exp() - from[c].exp();
             self.off += (to[c] - from[c]).powi(2);
         }
-        let [to, from] = [wanted, state].map(|state| state.rotation.row::<4>(row).map(f64::from));
+        let [to, from] = [target, state].map(|state| state.rotation.row::<4>(row).map(f64::from));
         let [wide, long] = [to, from].map(|q| q.iter().map(|x| x * x).sum::<f64>().sqrt());
         let sign = 1f64.copysign((0..4).map(|c| to[c] * from[c]).sum());
         for c in 0..4 {
@@ -246,7 +246,7 @@ impl StateDifference {
             self.rotation[c] += long * lacks;
             self.off += lacks * lacks;
         }
-        let [to, from] = [wanted, state].map(|state| opacity(state.opacity_logit.plane(0)[row]));
+        let [to, from] = [target, state].map(|state| opacity(state.opacity_logit.plane(0)[row]));
         self.opacity += to - from;
     }
 

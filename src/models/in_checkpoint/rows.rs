@@ -80,7 +80,7 @@ pub(in crate::models) struct CheckpointReader {
 }
 
 impl CheckpointReader {
-    /// Creates a reader for `count` Gaussians with `own` format-specific parameters each; all values are still zero.
+    /// Creates a reader for `count` Gaussians with `width` format-specific parameters each; all values are still zero.
     ///
     /// # Errors
     /// Fails if this needs more memory than allowed.
@@ -88,13 +88,13 @@ impl CheckpointReader {
         checkpoint: Checkpoint,
         count: usize,
         sh_degree: usize,
-        own: usize,
+        width: usize,
     ) -> Result<CheckpointReader> {
-        let row = state_bytes(sh_degree, Attributes::all()) + 4 * own as u64;
+        let row = state_bytes(sh_degree, Attributes::all()) + 4 * width as u64;
         checkpoint.allow("", &format!("its {count} Gaussians"), row.saturating_mul(count as u64))?;
         let raw = StoredParams {
             gaussians: Gaussians::zeros(count, sh_degree),
-            format_specific: AttributeValues::zeros(own, count),
+            format_specific: AttributeValues::zeros(width, count),
         };
         Ok(CheckpointReader {
             tensors: RowTensors { checkpoint, count, params: Vec::new(), training_only: Vec::new() },

@@ -191,22 +191,22 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
     Ok(psnr)
 }
 
-/// Checks that the PSNR `found` of an archive against the result before quantization is at most [`MAX_SHORTFALL`] below
-/// the required PSNR `required_psnr`, dB. An archive with a byte limit always passes.
+/// Checks that the PSNR `actual` of an archive against the result before quantization is at most [`MAX_SHORTFALL`]
+/// below the required PSNR `required_psnr`, dB. An archive with a byte limit always passes.
 ///
 /// # Errors
-/// Fails if `found` is more than [`MAX_SHORTFALL`] below the smaller of `required_psnr` and [`ENOUGH_PSNR`]. Then some
+/// Fails if `actual` is more than [`MAX_SHORTFALL`] below the smaller of `required_psnr` and [`ENOUGH_PSNR`]. Then some
 /// values are so large that a quantization grid for them cannot represent the others.
-pub(crate) fn check_met(quality_target: QualityTarget, required_psnr: f64, found: f64) -> Result<()> {
+pub(crate) fn check_met(quality_target: QualityTarget, required_psnr: f64, actual: f64) -> Result<()> {
     let is_met =
-        matches!(quality_target, QualityTarget::Bytes(_)) || found >= required_psnr.min(ENOUGH_PSNR) - MAX_SHORTFALL;
+        matches!(quality_target, QualityTarget::Bytes(_)) || actual >= required_psnr.min(ENOUGH_PSNR) - MAX_SHORTFALL;
     match is_met {
         true => Ok(()),
         false => Err(Error::usage(format!(
             "an archive cannot reach the requested PSNR against the result before quantization: \
              expected {required_psnr:.1} dB, found {}\n  \
              some values may be far larger than all others: drop their Gaussians (--drop-ids), or write a .gseq",
-            decibels_text(found, 1)
+            decibels_text(actual, 1)
         ))),
     }
 }
@@ -232,7 +232,7 @@ pub(crate) fn bisect<T>(
 }
 
 /// Returns the number of octaves (doublings) by which a quantization step must grow so that it causes about the squared
-/// error `error`. `found` is the error that the present step causes. The result is limited to ±[`MAX_STEP_CHANGE`].
-pub(crate) fn step_change(error: f64, found: f64) -> f64 {
-    (0.5 * (error / found.max(MIN_ERROR)).log2()).clamp(-MAX_STEP_CHANGE, MAX_STEP_CHANGE)
+/// error `error`. `actual` is the error that the present step causes. The result is limited to ±[`MAX_STEP_CHANGE`].
+pub(crate) fn step_change(error: f64, actual: f64) -> f64 {
+    (0.5 * (error / actual.max(MIN_ERROR)).log2()).clamp(-MAX_STEP_CHANGE, MAX_STEP_CHANGE)
 }
