@@ -12,14 +12,10 @@
 //! The centers of overlapping windows are evenly spaced over the visible time, and each width is three quarters of the
 //! spacing. The sum of such windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%.
 //!
-//! Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the optical depth of the
-//! Gaussian is distributed among the curves. This is done by iterations that multiply each curve's depth by a factor,
-//! so all depths stay positive (Richardson 1972, Lucy 1974). The factors are raised to the power 1.5, which saves a
-//! third of the iterations.
-
-use std::ops::Range;
+//! The optical depth of the Gaussian is distributed among overlapping curves ([`super::optical_depths`]).
 
 use super::least_squares::polynomial;
+use super::optical_depths::{MAX_OPACITY, WIDTH_PER_INTERVAL, depth, estimate_depths, refine_depths};
 use super::windows::Windows;
 use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
 use crate::model::exp_log::{exp, ln};
@@ -89,34 +85,20 @@ impl CurveForm {
     }
 }
 
-/// Width of the time window of an overlapping curve, divided by the distance between the centers of neighboring
-/// windows.
-const WIDTH_PER_INTERVAL: f64 = 0.75;
-/// Maximum number of iterations that distribute the optical depth −ln(1 − opacity) of a Gaussian among the curves that
-/// replace it ([`TrackFit::refine_depths`]).
-const MAX_UPDATES: usize = 60;
-/// Tolerance of the iterations in [`TrackFit::refine_depths`], which change the optical depth of each curve. The
-/// iterations end once each curve meets one of two conditions:
-/// - The last iteration changed the curve's optical depth by less than this fraction.
-/// - The curve's optical depth before the last iteration was below this value, so the curve is nearly invisible.
-///
-/// The iterations start from optical depths of at least this value, or 0 for a curve whose window covers no frame.
-const CONVERGED: f64 = 2e-3;
-/// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
-const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Limit that decides which frames the fit of a curve uses:
-/// - The fit of the opacities of overlapping curves uses frames at which the time window is above this value.
-/// - The fit of the motion uses frames whose weight (window × opacity) is above this value times
-///   [`MIN_VISIBLE_OPACITY`].
+/// The fit of the motion of a curve uses the frames whose weight (window × opacity) is above this value times
+/// [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
-/// Number of iterations in [`TrackFit::refine_depths`] after which the error of overlapping curves is compared with
+/// Maximum number of iterations that distribute the optical depth of a Gaussian among the curves that replace it
+/// ([`refine_depths`]).
+const MAX_UPDATES: usize = 60;
+/// Number of iterations in [`refine_depths`] after which the error of overlapping curves is compared with
 /// [`MAX_FIRST_ERROR`].
 const FIRST_UPDATES: usize = 4;
-/// Largest error that overlapping curves may have after [`FIRST_UPDATES`] iterations, as a multiple of the tolerance.
-/// Curves with a larger error are skipped, because more iterations rarely reduce the error by this factor. Only if no
-/// curves meet the tolerance, the skipped ones are fitted with all iterations.
+/// Largest error that overlapping curves may have after [`FIRST_UPDATES`] iterations, as a multiple of the error with
+/// which they would be kept ([`TrackFit::max_excess`]). Curves with a larger error are skipped, because more iterations
+/// rarely reduce the error by this factor.
 const MAX_FIRST_ERROR: f64 = 2.0;
 
 /// Returns curves of the form `form` that represent `track`, the states of a Gaussian at all frames. Tries increasing
@@ -135,28 +117,27 @@ pub fn fit_curves(
     let span = [track.times[first], track.times[last]];
     let is_wide = |count: usize| WIDTH_PER_INTERVAL * (span[1] - span[0]) / count as f64 >= form.min_width;
     let max_intervals = form.max_intervals.min((last - first + 1).max(2));
-    let counts = || form.intervals().iter().take_while(|&&count| count <= max_intervals && is_wide(count));
-    // The first pass stops each attempt as soon as its error is too large. If all attempts fail, a second pass repeats
-    // them without stopping, and the curves with the smallest error are kept.
-    for seeks_best in [false, true] {
-        fit.seeks_best = seeks_best;
-        let has_fit = fit.try_constant_curve()
-            || (form.has_linear_motion && fit.try_fading_curve())
-            || fit.try_single_window()
-            || counts().any(|&count| fit.try_overlapping_curves(span, count));
-        if has_fit {
-            break;
+    let tried = form.intervals().iter().take_while(|&&count| count <= max_intervals && is_wide(count)).count();
+    let counts = &form.intervals()[..tried];
+    // The first pass stops each attempt as soon as its error is above the tolerance.
+    let has_fit = fit.try_constant_curve()
+        || (form.has_linear_motion && fit.try_fading_curve())
+        || fit.try_single_window()
+        || counts.iter().any(|&count| fit.try_overlapping_curves(span, count));
+    if !has_fit {
+        // A second pass finds the curves with the smallest error. It begins with the most curves, which usually have
+        // it, and stops each further attempt as soon as its error is above the smallest so far.
+        fit.seeks_best = true;
+        counts.iter().rev().for_each(|&count| _ = fit.try_overlapping_curves(span, count));
+        fit.try_single_window();
+        if form.has_linear_motion {
+            fit.try_fading_curve();
         }
+        fit.try_constant_curve();
     }
     let (_, curves, found) = fit.best.unwrap_or_default();
     *misfit = misfit.merged_with(found);
     curves.into_iter().filter(|curve| curve.opacity >= MIN_VISIBLE_OPACITY).collect()
-}
-
-/// Returns the optical depth −ln(1 − α) of a Gaussian of opacity α = `opacity`, which is first limited to
-/// [`MAX_OPACITY`].
-fn depth(opacity: f64) -> f64 {
-    -ln(1.0 - opacity.clamp(0.0, MAX_OPACITY))
 }
 
 /// Search for curves that represent one track. Each attempt of the search fits a certain number of curves and measures
@@ -203,14 +184,19 @@ impl<'a> TrackFit<'a> {
     /// Measures the error of `curves`, whose time windows are in `self.windows`. Keeps the curves if they meet the
     /// tolerance, or if `seeks_best` is set and they are the best so far. Returns whether they meet the tolerance.
     fn keep_if_good(&mut self, curves: Vec<CubicTrack>) -> bool {
-        let limit = match &self.best {
+        let Some((excess, found)) = self.measure_misfit(&curves, self.max_excess()) else { return false };
+        self.best = Some((excess, curves, found));
+        excess <= 1.0
+    }
+
+    /// Returns the largest ratio of an error to its tolerance with which curves are kept: 1 in the first pass over all
+    /// attempts, and less than that of the best curves so far in the second one.
+    fn max_excess(&self) -> f64 {
+        match &self.best {
             _ if !self.seeks_best => 1.0,
             Some((least, ..)) => least.next_down(),
             None => f64::INFINITY,
-        };
-        let Some((excess, found)) = self.measure_misfit(&curves, limit) else { return false };
-        self.best = Some((excess, curves, found));
-        excess <= 1.0
+        }
     }
 
     /// Makes one window with the center `center` and the width `width` the only one in `self.windows`, and returns the
@@ -298,73 +284,18 @@ impl<'a> TrackFit<'a> {
         let set_depths = |curves: &mut [CubicTrack], depths: &[f64]| {
             curves.iter_mut().zip(depths).for_each(|(curve, depth)| curve.opacity = 1.0 - exp(-depth));
         };
-        let mut depths = self.estimate_depths(count + 1);
-        if !self.seeks_best {
-            self.refine_depths(&mut depths, FIRST_UPDATES);
+        let mut depths = estimate_depths(&self.windows, &self.depths);
+        let max_excess = self.max_excess();
+        if max_excess.is_finite() {
+            refine_depths(&self.windows, &self.depths, &mut depths, FIRST_UPDATES);
             set_depths(&mut curves, &depths);
-            if self.measure_misfit(&curves, MAX_FIRST_ERROR).is_none() {
+            if self.measure_misfit(&curves, MAX_FIRST_ERROR * max_excess).is_none() {
                 return false;
             }
         }
-        self.refine_depths(&mut depths, MAX_UPDATES);
+        refine_depths(&self.windows, &self.depths, &mut depths, MAX_UPDATES);
         set_depths(&mut curves, &depths);
         self.keep_if_good(curves)
-    }
-
-    /// Returns an estimate of the optical depth of each of `count` curves at the center of its window. The windows are
-    /// in `self.windows`. The estimate is the mean optical depth of the Gaussian under the window, divided by the sum
-    /// of all windows at one time.
-    fn estimate_depths(&self, count: usize) -> Vec<f64> {
-        // Evenly spaced windows add up to their integral divided by their distance.
-        let overlap = WIDTH_PER_INTERVAL * std::f64::consts::PI.sqrt();
-        let estimate = |k: usize| {
-            let (frames, values) = self.windows.window_above(k, MIN_WEIGHT);
-            let weighted: f64 = values.iter().zip(&self.depths[frames]).map(|(value, depth)| value * depth).sum();
-            let sum: f64 = values.iter().sum();
-            // Positive, as the updates multiply it.
-            if sum > 0.0 { (weighted / sum / overlap).max(CONVERGED) } else { 0.0 }
-        };
-        (0..count).map(estimate).collect()
-    }
-
-    /// Changes `depths`, which holds for each curve the optical depth at the center of its window. Afterwards, the
-    /// depths of all curves add up to the depth of the Gaussian at every frame, as closely as the iterations reach. The
-    /// windows are in `self.windows`. Ends after `max_updates` iterations at the latest.
-    fn refine_depths(&self, depths: &mut [f64], max_updates: usize) {
-        // Frames that each window affects, with the values of the window there and the sum of these values.
-        let shares: Vec<(Range<usize>, &[f64], f64)> = (0..depths.len())
-            .map(|k| {
-                let (frames, values) = self.windows.window_above(k, MIN_WEIGHT);
-                (frames, values, values.iter().sum())
-            })
-            .collect();
-        // For each frame: the product of the transmittances of all curves, then target depth divided by depth.
-        let mut ratios = vec![1.0; self.depths.len()];
-        for _ in 0..max_updates {
-            // A window multiplies the opacity, not the depth, so each curve adds the depth of its windowed opacity.
-            ratios.fill(1.0);
-            for ((frames, values, _), depth) in shares.iter().zip(depths.iter()) {
-                let opacity = 1.0 - exp(-depth);
-                let ratios = &mut ratios[frames.clone()];
-                ratios
-                    .iter_mut()
-                    .zip(*values)
-                    .for_each(|(ratio, value)| *ratio *= 1.0 - (opacity * value).min(MAX_OPACITY));
-            }
-            ratios.iter_mut().zip(&self.depths).for_each(|(ratio, target)| *ratio = target / (-ln(*ratio)).max(1e-9));
-            let mut moved = 0.0f64;
-            for ((frames, values, sum), depth) in shares.iter().zip(depths.iter_mut()) {
-                let weighted: f64 =
-                    values.iter().zip(&ratios[frames.clone()]).map(|(value, ratio)| value * ratio).sum();
-                let ratio = if *sum > 0.0 { (weighted / sum).min(4.0) } else { 0.0 };
-                let by = ratio * ratio.sqrt();
-                moved = moved.max((by - 1.0).abs().min(*depth));
-                *depth = (*depth * by).min(self::depth(MAX_OPACITY));
-            }
-            if moved < CONVERGED {
-                break;
-            }
-        }
     }
 
     /// Returns a curve that follows the position and rotation of the track by least squares. Its time window is window
@@ -422,36 +353,49 @@ impl<'a> TrackFit<'a> {
     /// - The errors over all these frames, in their own units.
     fn measure_misfit(&self, curves: &[CubicTrack], limit: f64) -> Option<(f64, FitError)> {
         let (track, tolerance) = (self.track, self.tolerance);
-        let (mut worst, mut misfit) = (0.0f64, FitError::default());
-        for frame in 0..track.len() {
-            let (mut shown, mut away) = (0.0, 0.0);
-            let weight = tolerance.weight(track.opacity[frame]);
-            let own_depth = self.depths[frame].max(MIN_VISIBLE_OPACITY);
-            for (k, curve) in curves.iter().enumerate() {
-                let opacity = curve.opacity * self.windows.value(k, frame);
-                if opacity == 0.0 {
-                    continue;
-                }
-                let share = depth(opacity);
-                shown += share;
-                if opacity < MIN_VISIBLE_OPACITY {
+        // The optical depth of each curve at each frame of its window, and of all curves at each frame.
+        let mut curve_depths = Vec::new();
+        let mut depths = vec![0.0; track.len()];
+        for (k, curve) in curves.iter().enumerate() {
+            let (frames, values) = self.windows.window(k);
+            let first = curve_depths.len();
+            curve_depths.extend(values.iter().map(|value| depth(curve.opacity * value)));
+            depths[frames].iter_mut().zip(&curve_depths[first..]).for_each(|(sum, depth)| *sum += depth);
+        }
+        // Opacities are compared first, because their errors are fast to compute and often the largest.
+        let opacity_errors: Vec<f64> =
+            depths.iter().zip(&track.opacity).map(|(depth, opacity)| 1.0 - exp(-depth) - opacity).collect();
+        let is_compared = |frame: usize| self.visible[frame] || opacity_errors[frame] > MIN_VISIBLE_OPACITY;
+        let compared = || (0..track.len()).filter(|&frame| is_compared(frame));
+        let mut worst = compared().map(|frame| opacity_errors[frame].abs() / tolerance.opacity).fold(0.0, f64::max);
+        if worst > limit {
+            return None;
+        }
+        // For each frame, the sum over curves of optical depth times distance from the Gaussian.
+        let mut distances = vec![0.0; track.len()];
+        let mut curve_depths = curve_depths.into_iter();
+        for (k, curve) in curves.iter().enumerate() {
+            let (frames, values) = self.windows.window(k);
+            for ((frame, value), curve_depth) in frames.zip(values).zip(&mut curve_depths) {
+                if curve.opacity * value < MIN_VISIBLE_OPACITY {
                     continue;
                 }
                 let distance = track.distance(frame, curve.position_at(track.times[frame])) / self.middle_scales[frame];
-                away += share * distance;
+                distances[frame] += curve_depth * distance;
                 // A curve that is hardly visible in this frame need not be as close.
-                let factor = weight * (share / own_depth).min(1.0);
+                let fraction = (curve_depth / self.depths[frame].max(MIN_VISIBLE_OPACITY)).min(1.0);
+                let factor = tolerance.weight(track.opacity[frame]) * fraction;
                 worst = worst.max(factor * (distance / tolerance.position));
                 worst = worst.max(self.excess_beyond_position(frame, curve, worst / factor) * factor);
+                if worst > limit {
+                    return None;
+                }
             }
-            let apart = 1.0 - exp(-shown) - track.opacity[frame];
-            if self.visible[frame] || apart > MIN_VISIBLE_OPACITY {
-                worst = worst.max(apart.abs() / tolerance.opacity);
-                misfit.add_state(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
-            }
-            if worst > limit {
-                return None;
-            }
+        }
+        let mut misfit = FitError::default();
+        for frame in compared() {
+            let distance = if depths[frame] > 0.0 { distances[frame] / depths[frame] } else { 0.0 };
+            misfit.add_state(distance, opacity_errors[frame], track.opacity[frame]);
         }
         Some((worst, misfit))
     }

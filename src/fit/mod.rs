@@ -6,6 +6,7 @@
 
 mod curved;
 mod least_squares;
+mod optical_depths;
 mod straight;
 mod track;
 mod windows;
