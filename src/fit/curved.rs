@@ -157,6 +157,9 @@ struct TrackFit<'a> {
     samples: Vec<(usize, f64, f64)>,
     /// Time windows of the curves of the current attempt, in their order.
     windows: Windows,
+    /// For each frame, the fraction of light that all curves together let through, for the curves that were compared
+    /// last.
+    transmittances: Vec<f64>,
     /// Whether the curves with the smallest error are kept even if they do not meet the tolerance: false in the first
     /// pass over all attempts, true in the second one.
     seeks_best: bool,
@@ -176,6 +179,7 @@ impl<'a> TrackFit<'a> {
             middle_scales: (0..track.len()).map(|frame| track.middle_scale(frame)).collect(),
             samples: Vec::new(),
             windows: Windows::default(),
+            transmittances: Vec::new(),
             seeks_best: false,
             best: None,
         }
@@ -280,16 +284,22 @@ impl<'a> TrackFit<'a> {
         let width = WIDTH_PER_INTERVAL * apart;
         self.windows.clear();
         (0..=count).for_each(|k| self.windows.push(&self.track.times, start + k as f64 * apart, width));
-        let mut curves: Vec<CubicTrack> = (0..=count).map(|k| self.fit_motion(k)).collect();
         let set_depths = |curves: &mut [CubicTrack], depths: &[f64]| {
             curves.iter_mut().zip(depths).for_each(|(curve, depth)| curve.opacity = 1.0 - exp(-depth));
         };
         let mut depths = estimate_depths(&self.windows, &self.depths);
-        let max_excess = self.max_excess();
-        if max_excess.is_finite() {
+        let max_first_error = MAX_FIRST_ERROR * self.max_excess();
+        if max_first_error.is_finite() {
             refine_depths(&self.windows, &self.depths, &mut depths, FIRST_UPDATES);
+            let opacities: Vec<f64> = depths.iter().map(|depth| 1.0 - exp(-depth)).collect();
+            if self.compare_opacities(&opacities) > max_first_error {
+                return false;
+            }
+        }
+        let mut curves: Vec<CubicTrack> = (0..=count).map(|k| self.fit_motion(k)).collect();
+        if max_first_error.is_finite() {
             set_depths(&mut curves, &depths);
-            if self.measure_misfit(&curves, MAX_FIRST_ERROR * max_excess).is_none() {
+            if self.measure_misfit(&curves, max_first_error).is_none() {
                 return false;
             }
         }
@@ -351,35 +361,24 @@ impl<'a> TrackFit<'a> {
     ///   [`Tolerance::weight`], and the fraction of the Gaussian's optical depth that the curve has at the frame. So a
     ///   curve that is hardly visible at a frame need not be close to the Gaussian there.
     /// - The errors over all these frames, in their own units.
-    fn measure_misfit(&self, curves: &[CubicTrack], limit: f64) -> Option<(f64, FitError)> {
-        let (track, tolerance) = (self.track, self.tolerance);
-        // The optical depth of each curve at each frame of its window, and of all curves at each frame.
-        let mut curve_depths = Vec::new();
-        let mut depths = vec![0.0; track.len()];
-        for (k, curve) in curves.iter().enumerate() {
-            let (frames, values) = self.windows.window(k);
-            let first = curve_depths.len();
-            curve_depths.extend(values.iter().map(|value| depth(curve.opacity * value)));
-            depths[frames].iter_mut().zip(&curve_depths[first..]).for_each(|(sum, depth)| *sum += depth);
-        }
+    fn measure_misfit(&mut self, curves: &[CubicTrack], limit: f64) -> Option<(f64, FitError)> {
         // Opacities are compared first, because their errors are fast to compute and often the largest.
-        let opacity_errors: Vec<f64> =
-            depths.iter().zip(&track.opacity).map(|(depth, opacity)| 1.0 - exp(-depth) - opacity).collect();
-        let is_compared = |frame: usize| self.visible[frame] || opacity_errors[frame] > MIN_VISIBLE_OPACITY;
-        let compared = || (0..track.len()).filter(|&frame| is_compared(frame));
-        let mut worst = compared().map(|frame| opacity_errors[frame].abs() / tolerance.opacity).fold(0.0, f64::max);
+        let opacities: Vec<f64> = curves.iter().map(|curve| curve.opacity).collect();
+        let mut worst = self.compare_opacities(&opacities);
         if worst > limit {
             return None;
         }
+        let (track, tolerance) = (self.track, self.tolerance);
         // For each frame, the sum over curves of optical depth times distance from the Gaussian.
         let mut distances = vec![0.0; track.len()];
-        let mut curve_depths = curve_depths.into_iter();
         for (k, curve) in curves.iter().enumerate() {
             let (frames, values) = self.windows.window(k);
-            for ((frame, value), curve_depth) in frames.zip(values).zip(&mut curve_depths) {
-                if curve.opacity * value < MIN_VISIBLE_OPACITY {
+            for (frame, value) in frames.zip(values) {
+                let opacity = curve.opacity * value;
+                if opacity < MIN_VISIBLE_OPACITY {
                     continue;
                 }
+                let curve_depth = depth(opacity);
                 let distance = track.distance(frame, curve.position_at(track.times[frame])) / self.middle_scales[frame];
                 distances[frame] += curve_depth * distance;
                 // A curve that is hardly visible in this frame need not be as close.
@@ -393,11 +392,37 @@ impl<'a> TrackFit<'a> {
             }
         }
         let mut misfit = FitError::default();
-        for frame in compared() {
-            let distance = if depths[frame] > 0.0 { distances[frame] / depths[frame] } else { 0.0 };
-            misfit.add_state(distance, opacity_errors[frame], track.opacity[frame]);
+        for frame in (0..track.len()).filter(|&frame| self.is_compared(frame)) {
+            let depth = -ln(self.transmittances[frame]);
+            let distance = if depth > 0.0 { distances[frame] / depth } else { 0.0 };
+            misfit.add_state(distance, self.opacity_error(frame), track.opacity[frame]);
         }
         Some((worst, misfit))
+    }
+
+    /// Compares the opacity of all curves together with that of the track at each frame. `opacities`: opacity of each
+    /// curve at the center of its window, which is in `self.windows`. Sets `self.transmittances`. Returns the largest
+    /// ratio of an error to its tolerance, over the frames in which the Gaussian or a curve is visible.
+    fn compare_opacities(&mut self, opacities: &[f64]) -> f64 {
+        self.transmittances.clear();
+        self.transmittances.resize(self.track.len(), 1.0);
+        for (k, opacity) in opacities.iter().enumerate() {
+            let (frames, values) = self.windows.window(k);
+            let of_curve = values.iter().map(|value| 1.0 - (opacity * value).min(MAX_OPACITY));
+            self.transmittances[frames].iter_mut().zip(of_curve).for_each(|(all, one)| *all *= one);
+        }
+        let compared = (0..self.track.len()).filter(|&frame| self.is_compared(frame));
+        compared.map(|frame| self.opacity_error(frame).abs()).fold(0.0, f64::max) / self.tolerance.opacity
+    }
+
+    /// Returns the opacity of all curves together minus that of the track at `frame`.
+    fn opacity_error(&self, frame: usize) -> f64 {
+        1.0 - self.transmittances[frame] - self.track.opacity[frame]
+    }
+
+    /// Returns whether the Gaussian or a curve is visible at `frame`, by the values in `self.transmittances`.
+    fn is_compared(&self, frame: usize) -> bool {
+        self.visible[frame] || self.opacity_error(frame) > MIN_VISIBLE_OPACITY
     }
 
     /// Returns the largest ratio of an error of `curve` at `frame` to its tolerance, over scales, SH coefficients and
