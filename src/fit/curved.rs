@@ -194,11 +194,12 @@ impl<'a> TrackFit<'a> {
     }
 
     /// Returns the largest ratio of an error to its tolerance with which curves are kept: 1 in the first pass over all
-    /// attempts, and less than that of the best curves so far in the second one.
+    /// attempts, and that of the best curves so far in the second one. Of curves with equal errors, the later attempt is
+    /// kept, which has fewer curves.
     fn max_excess(&self) -> f64 {
         match &self.best {
             _ if !self.seeks_best => 1.0,
-            Some((least, ..)) => least.next_down(),
+            Some((least, ..)) => *least,
             None => f64::INFINITY,
         }
     }
