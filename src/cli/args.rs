@@ -252,11 +252,11 @@ pub(super) struct Render {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
-    /// Render one view: the frame with this number, the first is 0. Needs --view and -o
+    /// Render one view: the frame with this number, counted from 0. Needs --view and -o
     #[arg(long, value_name = "T", requires = "view")]
     pub(super) frame: Option<u32>,
-    /// Number of the view (the camera) to render with --frame or --video; the first is 0. If training and test cameras
-    /// have the same numbers, also give --split
+    /// Number of the view (the camera) to render with --frame or --video: the number in the camera file, else counted
+    /// from 0. If training and test cameras have the same numbers, also give --split
     #[arg(long, value_name = "V", conflicts_with = "all")]
     pub(super) view: Option<u32>,
     /// Render every view of the split into a folder, as tNNN_vNN files
@@ -420,7 +420,7 @@ pub(super) struct ViewArgs {
     pub(super) original_degree: Option<u8>,
     #[command(flatten)]
     pub(super) background: Background,
-    /// Maximum size of a page in one file; a larger page is written as a folder
+    /// Maximum size of a page in one file; a larger page NAME.html is written as the folder NAME_page
     #[arg(long, value_name = "SIZE", default_value = DEFAULT_PAGE, value_parser = parse_bytes)]
     pub(super) page_limit: u64,
     /// Output: NAME.html, a single page, or a folder with index.html; both open without a server

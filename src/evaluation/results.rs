@@ -179,8 +179,8 @@ pub struct Evaluation {
 }
 
 impl QualityMeans {
-    /// Computes the means of `scores`. Without quality measures, `pairs` is 0, and PSNR and SSIM are NaN, which JSON
-    /// writes as null.
+    /// Computes the means of `scores`, the quality measures of views. If `scores` is empty, `pairs` is 0, and PSNR and
+    /// SSIM are NaN, which JSON writes as null.
     fn from_scores(scores: &[ImageQuality]) -> QualityMeans {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         let all = |value: fn(&ImageQuality) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());

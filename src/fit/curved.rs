@@ -91,7 +91,7 @@ const RIDGE: f64 = 1e-6;
 /// [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
 /// Maximum number of iterations that distribute the optical depth of a Gaussian among the curves that replace it
-/// ([`refine_depths`]).
+/// ([`refine_depths`]), in addition to the [`FIRST_UPDATES`].
 const MAX_UPDATES: usize = 60;
 /// Number of iterations in [`refine_depths`] after which the error of overlapping curves is compared with
 /// [`MAX_FIRST_ERROR`].
@@ -104,7 +104,8 @@ const MAX_FIRST_ERROR: f64 = 2.0;
 /// Returns curves of the form `form` that represent `track`, the states of a Gaussian at all frames. Tries increasing
 /// numbers of curves, and returns the first curves that meet `tolerance` at every visible frame. Numbers of curves
 /// whose error is far too large after a few iterations are skipped ([`MAX_FIRST_ERROR`]). If no curves meet the
-/// tolerance, returns those with the smallest error. Adds the errors of the returned curves to `misfit`.
+/// tolerance, tries all numbers again, from the largest to one curve, and returns the curves with the smallest error
+/// found. Adds the errors of the returned curves to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,
@@ -125,8 +126,8 @@ pub fn fit_curves(
         || fit.try_single_window()
         || counts.iter().any(|&count| fit.try_overlapping_curves(span, count));
     if !has_fit {
-        // A second pass finds the curves with the smallest error. It begins with the most curves, which usually have
-        // it, and stops each further attempt as soon as its error is above the smallest so far.
+        // The second pass finds the curves with the smallest error. It begins with the largest number of curves, whose
+        // error is usually the smallest. It stops every later attempt whose error exceeds the smallest so far.
         fit.seeks_best = true;
         counts.iter().rev().for_each(|&count| _ = fit.try_overlapping_curves(span, count));
         fit.try_single_window();
@@ -193,9 +194,9 @@ impl<'a> TrackFit<'a> {
         excess <= 1.0
     }
 
-    /// Returns the largest ratio of an error to its tolerance with which curves are kept: 1 in the first pass over all
-    /// attempts, and that of the best curves so far in the second one. Of curves with equal errors, the later attempt is
-    /// kept, which has fewer curves.
+    /// Returns the largest ratio of an error to its tolerance with which curves are kept. In the first pass over all
+    /// attempts it is 1; in the second pass it is the ratio of the best curves so far. Of curves with equal ratios the
+    /// later attempt is kept, because it never has more curves.
     fn max_excess(&self) -> f64 {
         match &self.best {
             _ if !self.seeks_best => 1.0,
@@ -279,7 +280,8 @@ impl<'a> TrackFit<'a> {
     }
 
     /// Tries `count` + 1 overlapping curves. The centers of their time windows are evenly spaced from the time `start`
-    /// to the time `end`, between which the Gaussian is visible. Returns whether the curves meet the tolerance.
+    /// to the time `end`, between which the Gaussian is visible. Returns whether the curves meet the tolerance; `false`
+    /// also if their error after [`FIRST_UPDATES`] iterations is too large ([`MAX_FIRST_ERROR`]).
     fn try_overlapping_curves(&mut self, [start, end]: [f64; 2], count: usize) -> bool {
         let apart = ((end - start) / count as f64).max(1e-9);
         let width = WIDTH_PER_INTERVAL * apart;
@@ -403,7 +405,7 @@ impl<'a> TrackFit<'a> {
 
     /// Compares the opacity of all curves together with that of the track at each frame. `opacities`: opacity of each
     /// curve at the center of its window, which is in `self.windows`. Sets `self.transmittances`. Returns the largest
-    /// ratio of an error to its tolerance, over the frames in which the Gaussian or a curve is visible.
+    /// ratio of an error to its tolerance, over the frames that count ([`TrackFit::is_compared`]).
     fn compare_opacities(&mut self, opacities: &[f64]) -> f64 {
         self.transmittances.clear();
         self.transmittances.resize(self.track.len(), 1.0);
@@ -421,7 +423,8 @@ impl<'a> TrackFit<'a> {
         1.0 - self.transmittances[frame] - self.track.opacity[frame]
     }
 
-    /// Returns whether the Gaussian or a curve is visible at `frame`, by the values in `self.transmittances`.
+    /// Returns whether errors at `frame` count: the Gaussian is visible there, or the opacity of all curves together, by
+    /// the values in `self.transmittances`, exceeds that of the Gaussian by more than [`MIN_VISIBLE_OPACITY`].
     fn is_compared(&self, frame: usize) -> bool {
         self.visible[frame] || self.opacity_error(frame) > MIN_VISIBLE_OPACITY
     }
@@ -497,10 +500,13 @@ mod tests {
             let wave = track(120, |t| [0.3 * (18.0 * t).sin(), 0.0, 0.0], |_| opacity);
             for form in [CurveForm::CUBIC, CurveForm::linear_with_min_width(0.02)] {
                 let found = fit_curves(&wave, form, &tolerance, &mut FitError::default());
-                let mut patient = TrackFit::new(&wave, form, &tolerance);
-                patient.seeks_best = true;
                 let span = [wave.times[0], wave.times[119]];
-                let expected = form.intervals().iter().find(|&&count| patient.try_overlapping_curves(span, count));
+                let fits = |count: usize| {
+                    // A fit that has no curves yet does not stop an attempt early.
+                    let new_fit = TrackFit::new(&wave, form, &tolerance);
+                    TrackFit { seeks_best: true, ..new_fit }.try_overlapping_curves(span, count)
+                };
+                let expected = form.intervals().iter().find(|&&count| fits(count));
                 // Curves at the ends of the sequence may be too faint to be returned.
                 let counts = expected.map(|count| count - 1..=count + 1);
                 assert!(

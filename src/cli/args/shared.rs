@@ -103,8 +103,8 @@ impl Earlier {
 /// Memory limit.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Memory {
-    /// Memory limit, such as 512MiB or 4GB [default: a quarter of the memory that this process may use, which is the
-    /// machine's memory or, if less, the limit of its control group, Slurm or Windows job, or ulimit]
+    /// Memory limit, such as 512MiB or 4GB [default: a quarter of the memory that this process may use: the smallest of
+    /// the machine's memory and the limits of its control group, its Slurm or Windows job, and ulimit]
     ///
     /// The limit does not change the result, except that refinement is reduced or left out if it needs more; the
     /// summary says so.
