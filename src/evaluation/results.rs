@@ -1,8 +1,8 @@
 //! Result of an evaluation as JSON, text and CSV: quality measures of every view and their means.
 //!
 //! Input: quality measures of every (frame, view) pair, sorted by frame, then view. Output: means over all views, per
-//! view and per frame, as JSON and text, and the quality measures themselves as CSV. Means are arithmetic and summed in
-//! the order of the views.
+//! view and per frame, as JSON and text, and the quality measures themselves as CSV. A mean is a sum, added in the order
+//! of the input, divided by the number of values.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -200,8 +200,8 @@ impl QualityMeans {
 
 impl Comparison {
     /// Averages quality measures over all `view_scores`, over the frames of each view, and over the views of each
-    /// frame. `view_scores` must be sorted by frame. `score` returns the measures to average, or `None` to leave out
-    /// this view at this frame. Returns `None` if no measures are left.
+    /// frame. `view_scores` must be sorted by frame. `score` returns the measures of an element of `view_scores`, or
+    /// `None` to leave the element out. Returns `None` if all elements are left out.
     pub fn from_views(
         view_scores: &[ViewQuality],
         score: impl Fn(&ViewQuality) -> Option<ImageQuality>,

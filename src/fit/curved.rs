@@ -15,10 +15,12 @@
 //! The optical depth of the Gaussian is distributed among overlapping curves ([`super::optical_depths`]).
 
 use super::least_squares::polynomial;
-use super::optical_depths::{MAX_OPACITY, WIDTH_PER_INTERVAL, depth, estimate_depths, refine_depths};
+use super::optical_depths::{
+    MAX_OPACITY, WIDTH_PER_INTERVAL, add_curve, depth, estimate_depths, opacity_from_depth, refine_depths,
+};
 use super::windows::Windows;
 use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
-use crate::model::exp_log::{exp, ln};
+use crate::model::exp_log::ln;
 
 /// Gaussian with cubic motion and linear rotation, visible in a window of time.
 #[derive(Debug, Clone, PartialEq)]
@@ -187,9 +189,13 @@ impl<'a> TrackFit<'a> {
     }
 
     /// Measures the error of `curves`, whose time windows are in `self.windows`. Keeps the curves if they meet the
-    /// tolerance, or if `seeks_best` is set and they are the best so far. Returns whether they meet the tolerance.
+    /// tolerance, or if `seeks_best` is set and no earlier curves have a smaller error. Returns whether they meet the
+    /// tolerance.
     fn keep_if_good(&mut self, curves: Vec<CubicTrack>) -> bool {
-        let Some((excess, found)) = self.measure_misfit(&curves, self.max_excess()) else { return false };
+        let opacities: Vec<f64> = curves.iter().map(|curve| curve.opacity).collect();
+        let opacity_excess = self.compare_opacities(&opacities);
+        let misfit = self.measure_misfit(&curves, opacity_excess, self.max_excess());
+        let Some((excess, found)) = misfit else { return false };
         self.best = Some((excess, curves, found));
         excess <= 1.0
     }
@@ -288,21 +294,24 @@ impl<'a> TrackFit<'a> {
         self.windows.clear();
         (0..=count).for_each(|k| self.windows.push(&self.track.times, start + k as f64 * apart, width));
         let set_depths = |curves: &mut [CubicTrack], depths: &[f64]| {
-            curves.iter_mut().zip(depths).for_each(|(curve, depth)| curve.opacity = 1.0 - exp(-depth));
+            curves.iter_mut().zip(depths).for_each(|(curve, depth)| curve.opacity = opacity_from_depth(*depth));
         };
         let mut depths = estimate_depths(&self.windows, &self.depths);
         let max_first_error = MAX_FIRST_ERROR * self.max_excess();
+        let mut opacity_excess = 0.0;
         if max_first_error.is_finite() {
             refine_depths(&self.windows, &self.depths, &mut depths, FIRST_UPDATES);
-            let opacities: Vec<f64> = depths.iter().map(|depth| 1.0 - exp(-depth)).collect();
-            if self.compare_opacities(&opacities) > max_first_error {
+            let opacities: Vec<f64> = depths.iter().map(|depth| opacity_from_depth(*depth)).collect();
+            // Opacities are compared before motions are fitted, because this is faster and often decides.
+            opacity_excess = self.compare_opacities(&opacities);
+            if opacity_excess > max_first_error {
                 return false;
             }
         }
         let mut curves: Vec<CubicTrack> = (0..=count).map(|k| self.fit_motion(k)).collect();
         if max_first_error.is_finite() {
             set_depths(&mut curves, &depths);
-            if self.measure_misfit(&curves, max_first_error).is_none() {
+            if self.measure_misfit(&curves, opacity_excess, max_first_error).is_none() {
                 return false;
             }
         }
@@ -357,21 +366,20 @@ impl<'a> TrackFit<'a> {
         }
     }
 
-    /// Compares `curves`, whose time windows are in `self.windows`, with the track at all frames in which the Gaussian
-    /// or a curve is visible. Returns two results, or `None` if the first is above `limit`:
+    /// Compares `curves`, whose time windows are in `self.windows`, with the track at the frames that count
+    /// ([`TrackFit::is_compared`]). `opacity_excess`: result of [`TrackFit::compare_opacities`] for the same curves,
+    /// which must be its last call. Returns two results, or `None` if the first is above `limit`:
     /// - The largest ratio of an error to its tolerance. It is at most 1 if the curves meet the tolerance. Errors that
     ///   are NaN are ignored. All errors of a curve except that of the opacity are first multiplied by two factors:
     ///   [`Tolerance::weight`], and the fraction of the Gaussian's optical depth that the curve has at the frame. So a
     ///   curve that is hardly visible at a frame need not be close to the Gaussian there.
     /// - The errors over all these frames, in their own units.
-    fn measure_misfit(&mut self, curves: &[CubicTrack], limit: f64) -> Option<(f64, FitError)> {
-        // Opacities are compared first, because their errors are fast to compute and often the largest.
-        let opacities: Vec<f64> = curves.iter().map(|curve| curve.opacity).collect();
-        let mut worst = self.compare_opacities(&opacities);
-        if worst > limit {
+    fn measure_misfit(&self, curves: &[CubicTrack], opacity_excess: f64, limit: f64) -> Option<(f64, FitError)> {
+        if opacity_excess > limit {
             return None;
         }
         let (track, tolerance) = (self.track, self.tolerance);
+        let mut worst = opacity_excess;
         // For each frame, the sum over curves of optical depth times distance from the Gaussian.
         let mut distances = vec![0.0; track.len()];
         for (k, curve) in curves.iter().enumerate() {
@@ -411,8 +419,7 @@ impl<'a> TrackFit<'a> {
         self.transmittances.resize(self.track.len(), 1.0);
         for (k, opacity) in opacities.iter().enumerate() {
             let (frames, values) = self.windows.window(k);
-            let of_curve = values.iter().map(|value| 1.0 - (opacity * value).min(MAX_OPACITY));
-            self.transmittances[frames].iter_mut().zip(of_curve).for_each(|(all, one)| *all *= one);
+            add_curve(&mut self.transmittances[frames], *opacity, values);
         }
         let compared = (0..self.track.len()).filter(|&frame| self.is_compared(frame));
         compared.map(|frame| self.opacity_error(frame).abs()).fold(0.0, f64::max) / self.tolerance.opacity

@@ -32,6 +32,20 @@ pub(super) fn depth(opacity: f64) -> f64 {
     -ln(1.0 - opacity.clamp(0.0, MAX_OPACITY))
 }
 
+/// Returns the opacity 1 − exp(−d) of a curve of optical depth d = `depth`.
+#[inline(always)]
+pub(super) fn opacity_from_depth(depth: f64) -> f64 {
+    1.0 - exp(-depth)
+}
+
+/// Multiplies the transmittance of all curves at each frame by that of one curve with the opacity `opacity` at the
+/// center of its window. `values`: values of its window at these frames.
+#[inline(always)]
+pub(super) fn add_curve(transmittances: &mut [f64], opacity: f64, values: &[f64]) {
+    let of_curve = values.iter().map(|value| 1.0 - (opacity * value).min(MAX_OPACITY));
+    transmittances.iter_mut().zip(of_curve).for_each(|(all, one)| *all *= one);
+}
+
 /// Returns an estimate of the optical depth of each curve at the center of its window: the mean of `track_depths` under
 /// the window, divided by the sum of all windows at one time. `windows`: time windows of the curves. `track_depths`:
 /// optical depth of the Gaussian at each frame.
@@ -85,11 +99,10 @@ fn iterate(windows: &Windows, track_depths: &[f64], depths: &mut [f64], max_upda
     let mut opacities = vec![0.0; depths.len()];
     for _ in 0..max_updates {
         // A window multiplies the opacity, not the depth, so each curve adds the depth of its windowed opacity.
-        opacities.iter_mut().zip(depths.iter()).for_each(|(opacity, depth)| *opacity = 1.0 - exp(-depth));
+        opacities.iter_mut().zip(depths.iter()).for_each(|(opacity, depth)| *opacity = opacity_from_depth(*depth));
         ratios.fill(1.0);
         for ((frames, values, _), opacity) in supports.iter().zip(&opacities) {
-            let transmittances = values.iter().map(|value| 1.0 - (opacity * value).min(MAX_OPACITY));
-            ratios[frames.clone()].iter_mut().zip(transmittances).for_each(|(ratio, factor)| *ratio *= factor);
+            add_curve(&mut ratios[frames.clone()], *opacity, values);
         }
         ratios.iter_mut().zip(track_depths).for_each(|(ratio, target)| *ratio = target / (-ln(*ratio)).max(1e-9));
         let mut moved = 0.0f64;

@@ -9,11 +9,11 @@ use crate::model::exp_log::exp;
 /// exp(−16) or less, so the curve is invisible.
 const MAX_WIDTHS: f64 = 4.0;
 
-/// Returns the value at `time` of the time window exp(−((time − center)/width)²). The width may be infinite.
-#[cfg(test)]
+/// Returns the value at `time` of the time window exp(−((time − center)/width)²). The width may be infinite. The time
+/// must be less than 26 widths from the center, because of the range of [`exp`].
 pub(super) fn window(time: f64, center: f64, width: f64) -> f64 {
     let widths = (time - center) / width;
-    if widths.abs() < MAX_WIDTHS { exp(-widths * widths) } else { 0.0 }
+    exp(-widths * widths)
 }
 
 /// Time windows of several curves that are fitted to one track, with the values of each window at the frames of the
@@ -44,11 +44,7 @@ impl Windows {
         let end = times.partition_point(|time| (time - center) / width < MAX_WIDTHS).max(first);
         self.shapes.push([center, width]);
         self.frames.push((first..end, self.values.len()));
-        // The loop has no branch, so the compiler vectorizes it.
-        self.values.extend(times[first..end].iter().map(|time| {
-            let widths = (time - center) / width;
-            exp(-widths * widths)
-        }));
+        self.values.extend(times[first..end].iter().map(|&time| window(time, center, width)));
     }
 
     /// Returns the number of windows.
@@ -98,7 +94,8 @@ mod tests {
         }
         for (k, (center, width)) in shapes.into_iter().enumerate() {
             for (frame, &time) in times.iter().enumerate() {
-                let expected = window(time, center, width);
+                let is_near = ((time - center) / width).abs() < MAX_WIDTHS;
+                let expected = if is_near { window(time, center, width) } else { 0.0 };
                 assert_eq!(windows.value(k, frame), expected, "window {k}, frame {frame}");
                 let (frames, values) = windows.window_above(k, 0.1);
                 assert_eq!(frames.contains(&frame), expected > 0.1, "window {k}, frame {frame}");

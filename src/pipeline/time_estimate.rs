@@ -23,7 +23,7 @@ const FIXED_SECONDS: f64 = 0.5;
 impl Forecast {
     /// Returns the forecast (expected time and memory) of a run. `work`: sizes of its input and views. `needs`:
     /// resource estimates of its stages. `least`: estimated core-seconds without the stages that may turn out to be
-    /// unnecessary. `searches`: whether the amount of work depends on intermediate results. `memory_bytes`: maximum
+    /// unnecessary; the expected time is the geometric mean of the times with and without them. `searches`: whether the amount of work depends on intermediate results. `memory_bytes`: maximum
     /// memory.
     pub(super) fn new(
         work: &Workload,
@@ -32,8 +32,8 @@ impl Forecast {
         searches: bool,
         memory_bytes: u64,
     ) -> Forecast {
-        // Stages that may turn out to be unnecessary take either their whole time or none. The geometric mean of the
-        // run's time with and without them differs from both by the same factor.
+        // Stages that may turn out to be unnecessary take either their whole time or none. The geometric mean differs
+        // from both times by the same factor.
         let all_stages = core_seconds(needs);
         let likely = (least * all_stages).sqrt();
         let measured = work.throughput.processors;
@@ -142,6 +142,8 @@ mod tests {
                 assert!(range.least < range.likely && range.likely < range.most, "{range:?}");
             }
         }
+        let may_skip = Forecast::new(&measured, &[need(40.0)], 10.0, false, 1 << 20).core_seconds;
+        assert_eq!((may_skip.likely, may_skip.most), (20.0, all[0].core_seconds.most));
         let width = |forecast: &Forecast| forecast.core_seconds.most / forecast.core_seconds.least;
         assert!(width(&all[0]) < width(&all[1]) && width(&all[0]) < width(&all[2]));
         let text = all[0].text(Verbosity::Plan);

@@ -487,14 +487,13 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Creates a renderer and a frame state buffer, as each thread needs them.
-    /// Returns the minimum number of views that are processed one after the other, with the same renderer and frame
-    /// state, if `view_count` views are divided among threads. It is above 1 if memory allows fewer renderers than there
-    /// are threads; then there are at most [`Limits::views_together`] of them.
+    /// Returns the minimum number of views that one thread processes, if `view_count` views are divided among threads.
+    /// It keeps the number of renderers that work at the same time at or below [`Limits::views_together`].
     ///
     /// [`Limits::views_together`]: crate::limits::Limits::views_together
     fn views_per_part(&self, view_count: usize) -> usize {
-        let renderers = self.scene.limits.views_together.max(1);
-        if renderers < rayon::current_num_threads() { view_count.div_ceil(renderers).max(1) } else { 1 }
+        let renderers = self.scene.limits.views_together;
+        if renderers < rayon::current_num_threads() { view_count.div_ceil(renderers) } else { 1 }
     }
 
     fn new_worker(&self) -> (Renderer, LinearizedState) {

@@ -112,9 +112,9 @@ impl RigCone {
     }
 }
 
-/// Sets the weights in `weighted` (pairs of a unit vector and its weight) to the weights ≥ 0 for which the weighted sum
-/// of the vectors is nearest to `direction`. Removes vectors whose weight is 0. Returns false if the vectors are
-/// linearly dependent.
+/// Finds weights ≥ 0 for which the weighted sum of unit vectors is nearest to `direction`. `weighted` has pairs of a
+/// vector and its weight; the weights are replaced, and vectors whose weight becomes 0 are removed. Returns false if the
+/// vectors are linearly dependent.
 fn fit_weights(weighted: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(weighted, direction) else { return false };

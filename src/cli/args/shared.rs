@@ -79,8 +79,8 @@ pub(in crate::cli) struct CacheArgs {
     /// Keep the results of finished stages in this folder. After an interruption, the same command continues from them
     #[arg(long, help_heading = CACHE, value_name = "FOLDER")]
     pub(in crate::cli) cache: Option<PathBuf>,
-    /// Compute only shard I (1 to N) of the next stage that can be divided, and store it in --cache. A run without this
-    /// option joins the shards and continues
+    /// Divide the next stage that can be divided into N shards, compute only shard I (1 to N), and store it in --cache.
+    /// Once all N are stored, a run without this option joins them and continues
     #[arg(long, help_heading = CACHE, value_name = "I/N", requires = "cache", hide_short_help = true)]
     pub(in crate::cli) shard: Option<Shard>,
 }
