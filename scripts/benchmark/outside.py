@@ -19,7 +19,11 @@ from measuring import Results, arguments, chosen, compress, evaluate
 
 SETTINGS = {
     "unrefined": ["--no-refine"],
+    "outside=0": ["--set", "outside=0"],
+    "outside=0.04": ["--set", "outside=0.04"],
+    "outside=0.05": ["--set", "outside=0.05"],
     "default": [],
+    "outside=0.08": ["--set", "outside=0.08"],
     "outside=0.5": ["--set", "outside=0.5"],
     "outside=1": ["--set", "outside=1"],
 }

@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::FrameStates;
 use crate::refinement::optimizer::{Adam, RateSchedule};
-use crate::render::{RemovalError, Renderer};
+use crate::render::{Image, RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, ReadPlan};
 
@@ -28,6 +28,10 @@ pub(super) struct StepParams {
     /// Loss that optimization steps minimize.
     pub(super) loss: Loss,
 }
+
+/// Part of the difference between the mean square of a step and the running mean square that is added to the latter
+/// (see [`limit_slope`]).
+const MEAN_UPDATE: f64 = 0.1;
 
 /// Minimum number of frames per keyframe of the time-varying delta ([`TrajectoryDelta`]: values that refinement adds to
 /// each frame, interpolated between keyframes).
@@ -87,6 +91,9 @@ pub(super) struct OptimizerState<'a> {
     /// Stride n of the training views: only every n-th column and row of pixels is rendered in optimization steps and
     /// for the ranking of a prune step.
     stride: NonZeroU32,
+    /// Running mean square of the derivatives of the loss with respect to color values ([`Loss::slope`]), over the
+    /// optimization steps on views that are not guard views ([`Targets::is_guard`]). `None` before the first such step.
+    mean_square_slope: Option<f64>,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
     /// Whether the frame states were evaluated again after `constant_optimizer` (optimizer of the stored parameters)
@@ -99,9 +106,10 @@ pub(super) struct OptimizerState<'a> {
 ///   frame states were not evaluated again after `constant_optimizer` was created,
 /// - delta, running means and step number of `constant_optimizer`,
 /// - number of steps since the frame states were evaluated,
+/// - running mean square of the derivatives with respect to color values,
 /// - delta, running means and step number of the optimizer of each keyframe.
 type OptimizerCheckpoint<Stored, Added, Means> =
-    (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
+    (Option<(Stored, Added)>, (Added, Means, usize), usize, Option<f64>, Vec<(Added, Means, usize)>);
 
 /// Contents of a checkpoint ([`OptimizerCheckpoint`]), read back from the cache.
 pub(super) type LoadedCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
@@ -140,6 +148,7 @@ impl<'a> OptimizerState<'a> {
             now: LinearizedState::none(state_degree),
             renderer: Renderer::on_all_threads(),
             stride: targets.stride(),
+            mean_square_slope: None,
             steps: 0,
             reevaluated: false,
             frames,
@@ -268,8 +277,13 @@ impl<'a> OptimizerState<'a> {
     pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
         let reevaluated = self.reevaluated.then_some((&self.stored, &self.baked_delta));
         let keyframe_optimizers = self.keyframe_optimizers.iter().map(Adam::checkpoint).collect();
-        let checkpoint: OptimizerCheckpoint<&StoredParams, &ParamDelta, &[Gaussians; 2]> =
-            (reevaluated, self.constant_optimizer.checkpoint(), self.steps, keyframe_optimizers);
+        let checkpoint: OptimizerCheckpoint<&StoredParams, &ParamDelta, &[Gaussians; 2]> = (
+            reevaluated,
+            self.constant_optimizer.checkpoint(),
+            self.steps,
+            self.mean_square_slope,
+            keyframe_optimizers,
+        );
         checkpoint
     }
 
@@ -280,7 +294,7 @@ impl<'a> OptimizerState<'a> {
     /// Fails if a scratch file cannot be written.
     pub(super) fn resume(
         &mut self,
-        (reevaluated, constant_optimizer, steps, keyframe_optimizers): LoadedCheckpoint,
+        (reevaluated, constant_optimizer, steps, mean_square_slope, keyframe_optimizers): LoadedCheckpoint,
     ) -> Result<()> {
         if let Some((stored, baked_delta)) = reevaluated {
             self.constant_optimizer.take_delta();
@@ -288,7 +302,7 @@ impl<'a> OptimizerState<'a> {
             self.reevaluate_states()?;
         }
         self.constant_optimizer.resume(constant_optimizer);
-        self.steps = steps;
+        (self.steps, self.mean_square_slope) = (steps, mean_square_slope);
         if !keyframe_optimizers.is_empty() {
             self.enable_keyframes(keyframe_optimizers.len());
             self.keyframe_optimizers
@@ -429,7 +443,12 @@ impl<'a> OptimizerState<'a> {
         let StepParams { columns, sh_degree, loss } = self.step_params;
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
-        let pull = |render: &_| (0.0, loss.slope(render, &target));
+        let (is_guard, mean_square) = (self.targets.is_guard(k), &mut self.mean_square_slope);
+        let pull = |render: &_| {
+            let mut slope = loss.slope(render, &target);
+            limit_slope(&mut slope, is_guard, mean_square);
+            (0.0, slope)
+        };
         self.renderer.gradient(&now.state, view, self.scene.background, pull, gradients);
         now.jacobian.pull_back(gradients);
         if let Some((present, gradients)) = now.present.as_ref().zip(sparse) {
@@ -456,13 +475,14 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Returns the squared error that removing each Gaussian would cause, summed over the target views with the indices
-    /// `views`. The square of `contrast_floor` is added to each squared color difference
-    /// ([`RemovalError::contrast_floor`]).
+    /// `views`. Guard views ([`Targets::is_guard`]) among them are left out. The square of `contrast_floor` is added to
+    /// each squared color difference ([`RemovalError::contrast_floor`]).
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
     pub(super) fn removal_error(&mut self, views: &[usize], contrast_floor: f32) -> Result<RemovalError> {
         self.free_buffers();
+        let views: Vec<usize> = views.iter().copied().filter(|&k| !self.targets.is_guard(k)).collect();
         let zero = || (self.new_worker(), RemovalError::new(self.fixed.len(), contrast_floor));
         let add_view = |((mut renderer, mut now), mut errors): ((Renderer, LinearizedState), RemovalError),
                         &k: &usize| {
@@ -486,7 +506,6 @@ impl<'a> OptimizerState<'a> {
         .unwrap_or_else(|| Ok(zero().1))
     }
 
-    /// Creates a renderer and a frame state buffer, as each thread needs them.
     /// Returns the minimum number of views that one thread processes, if `view_count` views are divided among threads.
     /// It keeps the number of renderers that work at the same time at or below [`Limits::views_together`].
     ///
@@ -496,7 +515,50 @@ impl<'a> OptimizerState<'a> {
         if renderers < rayon::current_num_threads() { view_count.div_ceil(renderers) } else { 1 }
     }
 
+    /// Creates a renderer and a frame state buffer, as each thread needs them.
     fn new_worker(&self) -> (Renderer, LinearizedState) {
         (Renderer::new(), LinearizedState::default())
+    }
+}
+
+/// Scales `slope`, the derivatives of the loss with respect to the color values of a guard view
+/// ([`Targets::is_guard`]), down to the root of `mean_square`, the running mean square of the derivatives at other
+/// views; to 0 if there is no mean yet. Renders of guard views have larger errors; Adam would divide the gradients of
+/// all later steps by these. Derivatives at a view that is not a guard view are not changed, and are added to the
+/// running mean.
+fn limit_slope(slope: &mut Image, is_guard: bool, mean_square: &mut Option<f64>) {
+    let sum: f64 = slope.data.iter().map(|&value| f64::from(value).powi(2)).sum();
+    let own = sum / slope.data.len().max(1) as f64;
+    match *mean_square {
+        mean if is_guard => {
+            let factor = (mean.unwrap_or(0.0) / own.max(f64::MIN_POSITIVE)).sqrt().min(1.0) as f32;
+            slope.data.iter_mut().for_each(|value| *value *= factor);
+        }
+        Some(mean) => *mean_square = Some(mean + MEAN_UPDATE * (own - mean)),
+        None => *mean_square = Some(own),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn guard_views_pull_no_harder_than_other_views() {
+        let image = |value: f32| Image { width: 2, height: 1, data: vec![value, -value, 0.0, value, -value, 0.0] };
+        let limited = |value: f32, is_guard: bool, mean: &mut Option<f64>| {
+            let mut slope = image(value);
+            limit_slope(&mut slope, is_guard, mean);
+            slope.data[0]
+        };
+        let mut mean = None;
+        assert_eq!((limited(0.5, true, &mut mean), mean), (0.0, None));
+        assert_eq!(limited(0.1, false, &mut mean), 0.1);
+        assert!((mean.unwrap() - 2.0 / 3.0 * 0.01).abs() < 1e-9);
+        assert!((limited(0.5, true, &mut mean) - 0.1).abs() < 1e-6, "scaled to the mean");
+        assert_eq!(limited(0.05, true, &mut mean), 0.05, "never scaled up");
+        let before = mean.unwrap();
+        limited(0.2, false, &mut mean);
+        assert!((mean.unwrap() - (before + MEAN_UPDATE * (2.0 / 3.0 * 0.04 - before))).abs() < 1e-9);
     }
 }

@@ -14,7 +14,7 @@ use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::views_between::{SplitMix64, cameras_between};
-use crate::scene::views_outside::cameras_outside;
+use crate::scene::views_outside::{MIN_SCORED_REACH, cameras_outside};
 
 /// Name of the cache entry of the target views that show only renders.
 pub(crate) const NAME: &str = "targets";
@@ -96,6 +96,8 @@ pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
     pub(crate) views: Vec<FrameView>,
+    /// Indices in `cameras` of the cameras whose views are guard views (see [`Targets::is_guard`]).
+    guard_cameras: Range<u32>,
     /// Purpose of each target view.
     purposes: Vec<Purpose>,
     /// Stride n of the training views: only every n-th column and row of pixels is stored.
@@ -115,6 +117,10 @@ pub(crate) struct Targets {
 /// the rig if it sees the scene from a new direction, one that does not lie between the directions of the scene's
 /// cameras.
 const OUTSIDE_FRACTION: f64 = 0.5;
+/// Maximum factor of the angle between a new camera outside the rig and the mean direction of the rig. Factors are
+/// random from 1 to this value, but the angle at most doubles, so about half of the cameras are at twice the angle of a
+/// camera of the rig. Nearer cameras raised the quality further outside less.
+const OUTSIDE_MAX_FACTOR: f64 = 3.0;
 
 /// Purpose of a target view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -134,10 +140,10 @@ impl Targets {
     pub(crate) fn new(scene: &Scene, max_views: usize, stride: NonZeroU32, has_test_views: bool) -> Result<Targets> {
         let [scene_views, new_views] = view_counts(max_views, scene.workload().pixels);
         let seen = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
-        let (cameras, views) = add_new_views(scene, seen, new_views);
+        let (cameras, views, guard_cameras) = add_new_views(scene, seen, new_views);
         let purposes = (0..views.len()).map(|k| purpose(k, views.len(), has_test_views)).collect();
         let key = scene.work.key(&(&cameras, &views, stride, has_test_views));
-        let targets = Targets { cameras, views, purposes, stride, key, values: Vec::new() };
+        let targets = Targets { cameras, views, guard_cameras, purposes, stride, key, values: Vec::new() };
         targets.filled(NAME, scene, |_| None)
     }
 
@@ -176,14 +182,14 @@ impl Targets {
         let validation: HashSet<(usize, u32)> =
             seen.iter().enumerate().filter(is_validation).map(|(_, view)| frame_and_view(view)).collect();
         let stamps = photographs.file_fingerprints(&seen)?;
-        let (cameras, views) = add_new_views(scene, seen, new_views);
+        let (cameras, views, guard_cameras) = add_new_views(scene, seen, new_views);
         let purpose = |view: &FrameView| match validation.contains(&frame_and_view(view)) {
             true => Purpose::Validation,
             false => Purpose::Training,
         };
         let purposes = views.iter().map(purpose).collect();
         let key = scene.work.key(&(&cameras, &views, stride, stamps));
-        let targets = Targets { cameras, views, purposes, stride, key, values: Vec::new() };
+        let targets = Targets { cameras, views, guard_cameras, purposes, stride, key, values: Vec::new() };
         targets.filled(PHOTOGRAPHS_NAME, scene, |view| {
             // A view from a new camera has no photograph.
             let camera = *used.get(view.camera as usize)?;
@@ -272,6 +278,14 @@ impl Targets {
         &self.cameras[self.views[k].camera as usize]
     }
 
+    /// Returns whether target view `k` is a guard view. A guard view shows the scene from outside the rig. A scene with
+    /// a small weight of such views, [`Scene::outside`] below [`MIN_SCORED_REACH`], has only a few, which keep renders
+    /// from outside from getting much worse than those from the scene's cameras: their gradients are scaled down to the
+    /// usual magnitude, and prune steps do not rank by them.
+    pub(super) fn is_guard(&self, k: usize) -> bool {
+        self.guard_cameras.contains(&self.views[k].camera)
+    }
+
     /// Returns how many columns and how many rows of pixels of view `k` are rendered and compared, if only every
     /// `stride`-th column and row is used.
     fn size(&self, k: usize, stride: NonZeroU32) -> [usize; 2] {
@@ -320,9 +334,13 @@ fn purpose(k: usize, count: usize, has_test_views: bool) -> Purpose {
 }
 
 /// Adds to `views`, by which Gaussians are scored, `between_views` views from new cameras: cameras between those of the
-/// scene and, if [`Scene::outside`] is not 0, cameras outside the rig. Returns the cameras, and the views sorted by
-/// frame.
-fn add_new_views(scene: &Scene, mut views: Vec<FrameView>, between_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
+/// scene and, if [`Scene::outside`] is not 0, cameras outside the rig. Returns the cameras, the views sorted by frame,
+/// and the indices of the cameras whose views are guard views ([`Targets::is_guard`]).
+fn add_new_views(
+    scene: &Scene,
+    mut views: Vec<FrameView>,
+    between_views: usize,
+) -> (Vec<Camera>, Vec<FrameView>, Range<u32>) {
     let used = scene.schedule.used_cameras();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
     for view in &mut views {
@@ -332,15 +350,17 @@ fn add_new_views(scene: &Scene, mut views: Vec<FrameView>, between_views: usize)
     let rig = scene.rig_cameras();
     let more_views = if seen == 0 { 0 } else { between_views };
     let outer_views = (OUTSIDE_FRACTION * scene.outside * more_views as f64) as usize;
-    let outer = cameras_outside(&rig, outer_views, 1.0 + scene.outside);
+    let outer = cameras_outside(&rig, outer_views, OUTSIDE_MAX_FACTOR);
     let inner = cameras_between(&rig, more_views - outer.len());
+    let guards = if scene.outside < MIN_SCORED_REACH { outer.len() } else { 0 };
+    let guard_cameras = cameras.len() as u32..(cameras.len() + guards) as u32;
     for camera in outer.into_iter().chain(inner) {
         let frame = views[random.next_below(seen)].frame;
         views.push(FrameView { frame, view: u32::MAX, camera: cameras.len() as u32 });
         cameras.push(camera);
     }
     views.sort_by_key(|view| view.frame);
-    (cameras, views)
+    (cameras, views, guard_cameras)
 }
 
 /// Returns the mean square error of `render` against the target view `target`, whose color values are 16-bit integers.

@@ -382,6 +382,25 @@ fn values_at_a_stride_do_not_depend_on_the_stored_stride() {
 }
 
 #[test]
+fn a_small_weight_of_the_outside_gives_guard_views() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut scene = scene(folder.path());
+    let scene_cameras = scene.schedule.cameras.len();
+    let guards = |scene: &Scene| {
+        let targets = Targets::new(scene, 500, NonZeroU32::MIN, false).unwrap();
+        (0..targets.views.len()).filter(|&k| targets.is_guard(k)).count()
+    };
+    assert_eq!(guards(&scene), 0);
+    scene.add_outside_views(0.09);
+    assert_eq!(scene.schedule.cameras.len(), scene_cameras, "scores and ranks have no views from outside");
+    // 0.09 / 2 of the 443 target views that are not from cameras of the scene.
+    assert_eq!(guards(&scene), 19);
+    scene.add_outside_views(0.5);
+    assert!(scene.schedule.cameras.len() > scene_cameras);
+    assert_eq!(guards(&scene), 0);
+}
+
+#[test]
 fn strides_leave_enough_pixels_per_gaussian() {
     let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, true).unwrap();
     let stride = |pixels, survivors| refine.stride(pixels, survivors).get();

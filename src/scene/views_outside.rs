@@ -20,6 +20,10 @@ const MAX_CAMERAS: usize = 64;
 /// Minimum angle at which a camera counts as outside the rig, radians (2°): the angle between the direction of the
 /// camera and the nearest direction in the cone of the rig ([`RigCone`]).
 pub const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
+/// Minimum weight of the quality outside the rig (the parameter `outside`) at which views from outside are scored and
+/// rank the Gaussians. With a smaller weight, only refinement has such views: to score them would cost quality at the
+/// cameras of the scene.
+pub const MIN_SCORED_REACH: f64 = 0.1;
 /// Maximum number of random cameras that are tried for each wanted camera outside the rig.
 const TRIES_PER_CAMERA: usize = 64;
 /// Maximum number of iterations in [`RigCone::angle`], which searches a cone for the direction nearest to a given one.
@@ -113,8 +117,8 @@ impl RigCone {
 }
 
 /// Finds weights ≥ 0 for which the weighted sum of unit vectors is nearest to `direction`. `weighted` has pairs of a
-/// vector and its weight; the weights are replaced, and vectors whose weight becomes 0 are removed. Returns false if the
-/// vectors are linearly dependent.
+/// vector and its weight; the weights are replaced, and vectors whose weight becomes 0 are removed. Returns false if
+/// the vectors are linearly dependent.
 fn fit_weights(weighted: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(weighted, direction) else { return false };
@@ -208,9 +212,12 @@ impl Scene {
     ///   random factor from 1 to at most 1 + `reach`.
     /// - Number of added views: a frame with n views gets `reach` · n more, rounded up.
     ///
-    /// Adds no views if `reach` is 0 or if no camera outside the rig can be found (see [`cameras_outside`]).
+    /// Adds no views if no camera outside the rig can be found (see [`cameras_outside`]), or if `reach` is less than
+    /// [`MIN_SCORED_REACH`]. Refinement then still fits a few views from outside ([`Scene::outside`]), unless `reach`
+    /// is 0.
     pub fn add_outside_views(&mut self, reach: f64) {
-        if reach == 0.0 {
+        if reach < MIN_SCORED_REACH {
+            self.outside = reach;
             return;
         }
         let rig_cameras = self.rig_cameras();
