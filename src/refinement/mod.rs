@@ -4,8 +4,9 @@
 //! Pruning leaves holes that only the survivors can fill, by growing their footprints over them. Gradient descent
 //! reduces the squared error (and, if set, 1 − SSIM) of one target view after another. Target views are renders of the
 //! original from the cameras by which Gaussians are scored and from cameras in between, so that the result is not
-//! overfitted to a few views. If many Gaussians have to go, refinement removes them in prune steps: optimize, rank the
-//! Gaussians again, remove the lowest-ranked, repeat. The final optimization steps follow the last prune step.
+//! overfitted to a few views; a few are from outside the rig (`outside`). If many Gaussians have to go, refinement
+//! removes them in prune steps: optimize, rank the Gaussians again, remove the lowest-ranked, repeat. The final
+//! optimization steps follow the last prune step.
 //!
 //! Some target views are used for validation only. They are rendered before the final steps and several times during
 //! them, and the parameters with the best validation quality are written. A deformation field is not changed.
@@ -58,8 +59,8 @@ pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
 const MIN_START_COUNT_FRACTION: f64 = 0.4;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_KEPT_FRACTION: f64 = 0.8;
-/// Number of views by which the Gaussians are ranked for one prune step. Each prune step takes the next views of the
-/// random order of the training views.
+/// Number of views by which the Gaussians are ranked for one prune step, less the guard views among them. Each prune
+/// step takes the next views of the random order of the training views.
 const RANKING_VIEWS: usize = 48;
 /// Bytes of memory per Gaussian for its removal error, its position, a k-d tree and marks while a prune step chooses
 /// the Gaussians that stay.

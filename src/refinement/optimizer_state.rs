@@ -29,9 +29,9 @@ pub(super) struct StepParams {
     pub(super) loss: Loss,
 }
 
-/// Part of the difference between the mean square of a step and the running mean square that is added to the latter
-/// (see [`limit_slope`]).
-const MEAN_UPDATE: f64 = 0.1;
+/// Weight of the newest step in the running mean square of derivatives (see [`limit_slope`]). The earlier mean has the
+/// rest of 1.
+const NEWEST_WEIGHT: f64 = 0.1;
 
 /// Minimum number of frames per keyframe of the time-varying delta ([`TrajectoryDelta`]: values that refinement adds to
 /// each frame, interpolated between keyframes).
@@ -444,6 +444,7 @@ impl<'a> OptimizerState<'a> {
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
         let (is_guard, mean_square) = (self.targets.is_guard(k), &mut self.mean_square_slope);
+        // Also updates the running mean.
         let pull = |render: &_| {
             let mut slope = loss.slope(render, &target);
             limit_slope(&mut slope, is_guard, mean_square);
@@ -521,20 +522,24 @@ impl<'a> OptimizerState<'a> {
     }
 }
 
-/// Scales `slope`, the derivatives of the loss with respect to the color values of a guard view
-/// ([`Targets::is_guard`]), down to the root of `mean_square`, the running mean square of the derivatives at other
-/// views; to 0 if there is no mean yet. Renders of guard views have larger errors; Adam would divide the gradients of
-/// all later steps by these. Derivatives at a view that is not a guard view are not changed, and are added to the
-/// running mean.
+/// Limits the derivatives `slope` of the loss of a guard view ([`Targets::is_guard`]) with respect to its color values.
+/// If their root mean square is above the root of `mean_square`, they are scaled down to it; if there is no mean yet, to
+/// 0. Without the limit, the large errors of guard views would raise the gradient magnitudes by which Adam divides, and
+/// so shorten later steps. The derivatives of any other view stay as they are, and their mean square updates
+/// `mean_square`. Values that are not finite do not count: the renderer ignores their pixels.
 fn limit_slope(slope: &mut Image, is_guard: bool, mean_square: &mut Option<f64>) {
-    let sum: f64 = slope.data.iter().map(|&value| f64::from(value).powi(2)).sum();
-    let own = sum / slope.data.len().max(1) as f64;
+    let squares = slope.data.iter().map(|&value| f64::from(value).powi(2)).filter(|square| square.is_finite());
+    let (sum, count) = squares.fold((0.0, 0u32), |(sum, count), square| (sum + square, count + 1));
+    if count == 0 {
+        return;
+    }
+    let own = sum / f64::from(count);
     match *mean_square {
         mean if is_guard => {
             let factor = (mean.unwrap_or(0.0) / own.max(f64::MIN_POSITIVE)).sqrt().min(1.0) as f32;
             slope.data.iter_mut().for_each(|value| *value *= factor);
         }
-        Some(mean) => *mean_square = Some(mean + MEAN_UPDATE * (own - mean)),
+        Some(mean) => *mean_square = Some(mean + NEWEST_WEIGHT * (own - mean)),
         None => *mean_square = Some(own),
     }
 }
@@ -559,6 +564,12 @@ mod tests {
         assert_eq!(limited(0.05, true, &mut mean), 0.05, "never scaled up");
         let before = mean.unwrap();
         limited(0.2, false, &mut mean);
-        assert!((mean.unwrap() - (before + MEAN_UPDATE * (2.0 / 3.0 * 0.04 - before))).abs() < 1e-9);
+        assert!((mean.unwrap() - (before + 0.1 * (2.0 / 3.0 * 0.04 - before))).abs() < 1e-9);
+        let before = mean;
+        let mut odd = image(f32::NAN);
+        limit_slope(&mut odd, false, &mut mean);
+        assert!(mean.unwrap() < before.unwrap(), "only the zeros of the view count");
+        limit_slope(&mut Image { width: 0, height: 0, data: Vec::new() }, false, &mut mean);
+        assert!(mean.unwrap() > 0.0);
     }
 }

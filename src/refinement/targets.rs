@@ -14,7 +14,7 @@ use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::views_between::{SplitMix64, cameras_between};
-use crate::scene::views_outside::{MIN_SCORED_REACH, cameras_outside};
+use crate::scene::views_outside::{MIN_SCORED_OUTSIDE, cameras_outside};
 
 /// Name of the cache entry of the target views that show only renders.
 pub(crate) const NAME: &str = "targets";
@@ -117,10 +117,10 @@ pub(crate) struct Targets {
 /// the rig if it sees the scene from a new direction, one that does not lie between the directions of the scene's
 /// cameras.
 const OUTSIDE_FRACTION: f64 = 0.5;
-/// Maximum factor of the angle between a new camera outside the rig and the mean direction of the rig. Factors are
-/// random from 1 to this value, but the angle at most doubles, so about half of the cameras are at twice the angle of a
-/// camera of the rig. Nearer cameras raised the quality further outside less.
-const OUTSIDE_MAX_FACTOR: f64 = 3.0;
+/// A new camera outside the rig is a camera turned away from the mean direction of the rig. Its angle from there is
+/// multiplied by a random factor from 1 to this value, but by at most 2. So at least half of the new cameras are at
+/// twice the angle. With a value of 2, cameras were nearer to the rig, and views far outside gained less quality.
+const OUTSIDE_DRAWN_FACTOR: f64 = 3.0;
 
 /// Purpose of a target view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -141,7 +141,11 @@ impl Targets {
         let [scene_views, new_views] = view_counts(max_views, scene.workload().pixels);
         let seen = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
         let (cameras, views, guard_cameras) = add_new_views(scene, seen, new_views);
-        let purposes = (0..views.len()).map(|k| purpose(k, views.len(), has_test_views)).collect();
+        let purpose = |k: usize| match guard_cameras.contains(&views[k].camera) {
+            true => Purpose::Training,
+            false => purpose(k, views.len(), has_test_views),
+        };
+        let purposes = (0..views.len()).map(purpose).collect();
         let key = scene.work.key(&(&cameras, &views, stride, has_test_views));
         let targets = Targets { cameras, views, guard_cameras, purposes, stride, key, values: Vec::new() };
         targets.filled(NAME, scene, |_| None)
@@ -278,10 +282,10 @@ impl Targets {
         &self.cameras[self.views[k].camera as usize]
     }
 
-    /// Returns whether target view `k` is a guard view. A guard view shows the scene from outside the rig. A scene with
-    /// a small weight of such views, [`Scene::outside`] below [`MIN_SCORED_REACH`], has only a few, which keep renders
-    /// from outside from getting much worse than those from the scene's cameras: their gradients are scaled down to the
-    /// usual magnitude, and prune steps do not rank by them.
+    /// Returns whether target view `k` is a guard view: a view from outside the rig, in a scene whose [`Scene::outside`]
+    /// is below [`MIN_SCORED_OUTSIDE`]. The few guard views keep renders from outside from getting much worse. All are
+    /// training views. Derivatives of their loss are scaled down to the usual magnitude, and prune steps do not rank by
+    /// them. From [`MIN_SCORED_OUTSIDE`] on, views from outside are used like all others, and there are no guard views.
     pub(super) fn is_guard(&self, k: usize) -> bool {
         self.guard_cameras.contains(&self.views[k].camera)
     }
@@ -333,13 +337,13 @@ fn purpose(k: usize, count: usize, has_test_views: bool) -> Purpose {
     }
 }
 
-/// Adds to `views`, by which Gaussians are scored, `between_views` views from new cameras: cameras between those of the
+/// Adds to `views`, by which Gaussians are scored, `new_views` views from new cameras: cameras between those of the
 /// scene and, if [`Scene::outside`] is not 0, cameras outside the rig. Returns the cameras, the views sorted by frame,
 /// and the indices of the cameras whose views are guard views ([`Targets::is_guard`]).
 fn add_new_views(
     scene: &Scene,
     mut views: Vec<FrameView>,
-    between_views: usize,
+    new_views: usize,
 ) -> (Vec<Camera>, Vec<FrameView>, Range<u32>) {
     let used = scene.schedule.used_cameras();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
@@ -348,11 +352,11 @@ fn add_new_views(
     }
     let (seen, mut random) = (views.len(), SplitMix64(2));
     let rig = scene.rig_cameras();
-    let more_views = if seen == 0 { 0 } else { between_views };
+    let more_views = if seen == 0 { 0 } else { new_views };
     let outer_views = (OUTSIDE_FRACTION * scene.outside * more_views as f64) as usize;
-    let outer = cameras_outside(&rig, outer_views, OUTSIDE_MAX_FACTOR);
+    let outer = cameras_outside(&rig, outer_views, OUTSIDE_DRAWN_FACTOR);
     let inner = cameras_between(&rig, more_views - outer.len());
-    let guards = if scene.outside < MIN_SCORED_REACH { outer.len() } else { 0 };
+    let guards = if scene.outside < MIN_SCORED_OUTSIDE { outer.len() } else { 0 };
     let guard_cameras = cameras.len() as u32..(cameras.len() + guards) as u32;
     for camera in outer.into_iter().chain(inner) {
         let frame = views[random.next_below(seen)].frame;

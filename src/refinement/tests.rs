@@ -6,7 +6,7 @@ use super::optimizer::RateSchedule;
 use super::optimizer_state::OptimizerState;
 use super::targets::Targets;
 use super::*;
-use crate::cache::CacheRequest;
+use crate::cache::{Cache, CacheRequest};
 use crate::compressed_model::CompressedModel;
 use crate::diagnostics::demo_scene;
 use crate::error::Result;
@@ -391,7 +391,14 @@ fn a_small_weight_of_the_outside_gives_guard_views() {
         (0..targets.views.len()).filter(|&k| targets.is_guard(k)).count()
     };
     assert_eq!(guards(&scene), 0);
+    let request = CacheRequest { folder: folder.path().join("work"), part: None };
+    scene.work = Cache::open(&request, String::new()).unwrap();
+    let key = scene.work.key(&0);
+    scene.work.store("refine", key, &1).unwrap();
+    scene.add_outside_views(0.0);
+    assert_eq!(scene.work.load("refine", key).unwrap(), Some(1));
     scene.add_outside_views(0.09);
+    assert_eq!(scene.work.load::<i32>("refine", key).unwrap(), None, "that result is of other target views");
     assert_eq!(scene.schedule.cameras.len(), scene_cameras, "scores and ranks have no views from outside");
     // 0.09 / 2 of the 443 target views that are not from cameras of the scene.
     assert_eq!(guards(&scene), 19);

@@ -45,8 +45,8 @@ pub struct Scene {
     /// were added. A camera is outside the rig if it sees the scene from a new direction.
     pub schedule: ViewSchedule,
     /// Weight, from 0 (ignored) to 1, of the quality of renders from directions in which the rig has no cameras. It is
-    /// the argument `reach` of [`Scene::add_outside_views`]; 0 if no camera outside the rig can be found for a `reach`
-    /// of at least [`views_outside::MIN_SCORED_REACH`].
+    /// the argument `reach` of [`Scene::add_outside_views`]. If `reach` is at least
+    /// [`views_outside::MIN_SCORED_OUTSIDE`] but no camera outside the rig can be found, it is 0.
     pub outside: f64,
     /// Whether the views show the whole scene: cameras were given or found, or were placed all around a scene of one
     /// frame. Otherwise the cameras are a virtual rig, which may see only what is in front of it, such as the outside

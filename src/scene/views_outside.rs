@@ -8,6 +8,7 @@ use glam::{DMat3, DQuat, DVec3};
 
 use super::Scene;
 use super::views_between::{SplitMix64, cameras_between, meeting_point};
+use crate::cache::CacheKey;
 use crate::model::{Camera, Rig, Split, ViewSchedule};
 
 /// View number of all views from cameras outside the rig. No data set uses this number.
@@ -23,7 +24,7 @@ pub const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
 /// Minimum weight of the quality outside the rig (the parameter `outside`) at which views from outside are scored and
 /// rank the Gaussians. With a smaller weight, only refinement has such views: to score them would cost quality at the
 /// cameras of the scene.
-pub const MIN_SCORED_REACH: f64 = 0.1;
+pub const MIN_SCORED_OUTSIDE: f64 = 0.1;
 /// Maximum number of random cameras that are tried for each wanted camera outside the rig.
 const TRIES_PER_CAMERA: usize = 64;
 /// Maximum number of iterations in [`RigCone::angle`], which searches a cone for the direction nearest to a given one.
@@ -213,11 +214,14 @@ impl Scene {
     /// - Number of added views: a frame with n views gets `reach` · n more, rounded up.
     ///
     /// Adds no views if no camera outside the rig can be found (see [`cameras_outside`]), or if `reach` is less than
-    /// [`MIN_SCORED_REACH`]. Refinement then still fits a few views from outside ([`Scene::outside`]), unless `reach`
+    /// [`MIN_SCORED_OUTSIDE`]. Refinement then still fits a few views from outside ([`Scene::outside`]), unless `reach`
     /// is 0.
     pub fn add_outside_views(&mut self, reach: f64) {
-        if reach < MIN_SCORED_REACH {
+        if reach < MIN_SCORED_OUTSIDE {
             self.outside = reach;
+            if reach > 0.0 {
+                self.work.depend_on(CacheKey::new(&reach));
+            }
             return;
         }
         let rig_cameras = self.rig_cameras();
