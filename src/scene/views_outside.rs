@@ -123,15 +123,20 @@ impl RigCone {
 fn fit_weights(weighted: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(weighted, direction) else { return false };
-        // Fraction of the change from the present weights to `free`, the best weights of any sign, at which the first
-        // weight becomes 0.
-        let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| (free <= 0.0).then(|| weight / (weight - free));
-        let step = weighted.iter().zip(&free).filter_map(limit).fold(1.0, f64::min);
+        // Fraction of the change from the present weights to `free`, the best weights of any sign, at which a weight
+        // becomes 0.
+        let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| match weight > 0.0 {
+            true => (free <= 0.0).then(|| weight / (weight - free)),
+            false => (free <= 0.0).then_some(0.0),
+        };
+        let limits = weighted.iter().zip(&free).map(limit).enumerate();
+        let first_zero = limits.filter_map(|(k, limit)| Some((k, limit?))).min_by(|a, b| a.1.total_cmp(&b.1));
+        let step = first_zero.map_or(1.0, |(_, limit)| limit);
         weighted.iter_mut().zip(&free).for_each(|((_, weight), free)| *weight += step * (free - *weight));
+        let Some((k, _)) = first_zero else { return true };
+        // Removed by its index, because rounding may leave its weight slightly above 0: the loop would then never end.
+        weighted.remove(k);
         weighted.retain(|&(_, weight)| weight > 0.0);
-        if step >= 1.0 {
-            return true;
-        }
     }
 }
 
@@ -279,6 +284,27 @@ mod tests {
         assert!((cone.angle_outside(&beyond) - a.angle_between(b)).abs() < 1e-6);
         let below = Camera::look_at(DVec3::new(0.0, -1.0, -4.0), DVec3::ZERO, 0.8, (64, 48));
         assert!((cone.angle_outside(&below) - PI / 2.0).abs() < 1e-6, "the cone ends at a right angle");
+    }
+
+    #[test]
+    fn search_for_the_nearest_direction_ends_for_all_directions() {
+        let mut random = SplitMix64(7);
+        let mut unit = || {
+            let mut axis = || 2.0 * random.next_unit_f64() - 1.0;
+            DVec3::new(axis(), axis(), axis()).normalize()
+        };
+        for cone in 0..300 {
+            // Narrow cones with nearly dependent directions are the hardest.
+            let middle = unit();
+            let directions: Vec<DVec3> = (0..13).map(|_| (middle + 0.3 * unit()).normalize()).collect();
+            let cone_of_rig = RigCone { focus: DVec3::ZERO, directions: directions.clone() };
+            for _ in 0..200 {
+                let direction = (middle + 0.5 * unit()).normalize();
+                let angle = cone_of_rig.angle(direction);
+                let to_camera = directions.iter().map(|own| own.angle_between(direction)).fold(PI, f64::min);
+                assert!((0.0..=to_camera + 1e-6).contains(&angle), "cone {cone}: {angle}, nearest camera {to_camera}");
+            }
+        }
     }
 
     #[test]
