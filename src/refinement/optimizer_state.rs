@@ -568,7 +568,7 @@ mod tests {
         let before = mean;
         let mut odd = image(f32::NAN);
         limit_slope(&mut odd, false, &mut mean);
-        assert!(mean.unwrap() < before.unwrap(), "only the zeros of the view count");
+        assert!(mean.unwrap() < before.unwrap(), "NaN is left out, and zeros lower the mean");
         limit_slope(&mut Image { width: 0, height: 0, data: Vec::new() }, false, &mut mean);
         assert!(mean.unwrap() > 0.0);
     }

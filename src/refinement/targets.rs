@@ -119,7 +119,7 @@ pub(crate) struct Targets {
 const OUTSIDE_FRACTION: f64 = 0.5;
 /// A new camera outside the rig is a camera turned away from the mean direction of the rig. Its angle from there is
 /// multiplied by a random factor from 1 to this value, but by at most 2. So at least half of the new cameras are at
-/// twice the angle. With a value of 2, cameras were nearer to the rig, and views far outside gained less quality.
+/// twice the angle. In measurements, the value 2 placed cameras nearer to the rig and gained less quality outside.
 const OUTSIDE_DRAWN_FACTOR: f64 = 3.0;
 
 /// Purpose of a target view.
@@ -282,10 +282,11 @@ impl Targets {
         &self.cameras[self.views[k].camera as usize]
     }
 
-    /// Returns whether target view `k` is a guard view: a view from outside the rig, in a scene whose [`Scene::outside`]
-    /// is below [`MIN_SCORED_OUTSIDE`]. The few guard views keep renders from outside from getting much worse. All are
-    /// training views. Derivatives of their loss are scaled down to the usual magnitude, and prune steps do not rank by
-    /// them. From [`MIN_SCORED_OUTSIDE`] on, views from outside are used like all others, and there are no guard views.
+    /// Returns whether target view `k` is a guard view: a view from outside the rig, in a scene whose
+    /// [`Scene::outside`] is below [`MIN_SCORED_OUTSIDE`]. The few guard views protect the quality of renders from
+    /// outside. All are training views. Derivatives of their loss are scaled down to the usual magnitude, and prune
+    /// steps do not rank by them. If the weight is larger, views from outside are used like all others, and there are
+    /// no guard views.
     pub(super) fn is_guard(&self, k: usize) -> bool {
         self.guard_cameras.contains(&self.views[k].camera)
     }

@@ -398,7 +398,7 @@ fn a_small_weight_of_the_outside_gives_guard_views() {
     scene.add_outside_views(0.0);
     assert_eq!(scene.work.load("refine", key).unwrap(), Some(1));
     scene.add_outside_views(0.09);
-    assert_eq!(scene.work.load::<i32>("refine", key).unwrap(), None, "that result is of other target views");
+    assert_eq!(scene.work.load::<i32>("refine", key).unwrap(), None, "the stored result was made without guard views");
     assert_eq!(scene.schedule.cameras.len(), scene_cameras, "scores and ranks have no views from outside");
     // 0.09 / 2 of the 443 target views that are not from cameras of the scene.
     assert_eq!(guards(&scene), 19);

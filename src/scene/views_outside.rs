@@ -8,7 +8,6 @@ use glam::{DMat3, DQuat, DVec3};
 
 use super::Scene;
 use super::views_between::{SplitMix64, cameras_between, meeting_point};
-use crate::cache::CacheKey;
 use crate::model::{Camera, Rig, Split, ViewSchedule};
 
 /// View number of all views from cameras outside the rig. No data set uses this number.
@@ -123,18 +122,18 @@ impl RigCone {
 fn fit_weights(weighted: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(weighted, direction) else { return false };
-        // Fraction of the change from the present weights to `free`, the best weights of any sign, at which a weight
-        // becomes 0.
-        let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| match weight > 0.0 {
-            true => (free <= 0.0).then(|| weight / (weight - free)),
-            false => (free <= 0.0).then_some(0.0),
+        // The weights change toward `free`, the best weights of any sign. A weight that would become negative limits
+        // the change to the fraction at which this weight is 0. A weight that is 0 already gives the fraction 0, not
+        // 0/0.
+        let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| {
+            (free <= 0.0).then(|| weight / (weight - free).max(f64::MIN_POSITIVE))
         };
         let limits = weighted.iter().zip(&free).map(limit).enumerate();
         let first_zero = limits.filter_map(|(k, limit)| Some((k, limit?))).min_by(|a, b| a.1.total_cmp(&b.1));
         let step = first_zero.map_or(1.0, |(_, limit)| limit);
         weighted.iter_mut().zip(&free).for_each(|((_, weight), free)| *weight += step * (free - *weight));
         let Some((k, _)) = first_zero else { return true };
-        // Removed by its index, because rounding may leave its weight slightly above 0: the loop would then never end.
+        // Rounding may leave this weight slightly above 0; without the removal the loop might never end.
         weighted.remove(k);
         weighted.retain(|&(_, weight)| weight > 0.0);
     }
@@ -225,7 +224,7 @@ impl Scene {
         if reach < MIN_SCORED_OUTSIDE {
             self.outside = reach;
             if reach > 0.0 {
-                self.work.depend_on(CacheKey::new(&reach));
+                self.depend_on_views();
             }
             return;
         }

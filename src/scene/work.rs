@@ -26,9 +26,10 @@ impl Scene {
         Ok(())
     }
 
-    /// Makes the keys of cache entries depend on the views of the schedule, which changed after the cache was opened.
+    /// Makes the keys of cache entries depend on the views of the schedule and on the weight of the quality outside the
+    /// rig ([`Scene::outside`]), after one of them has changed.
     pub(super) fn depend_on_views(&mut self) {
-        self.work.depend_on(CacheKey::new(&self.schedule));
+        self.work.depend_on(CacheKey::new(&(&self.schedule, self.outside)));
     }
 
     /// Returns the digest (hash of the content) of the input.
