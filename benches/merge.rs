@@ -70,13 +70,13 @@ fn evenly_distributed(n: usize) -> (Gaussians, f64) {
 type Find = fn(&AttributeValues, f64) -> usize;
 
 fn points(position: &AttributeValues) -> Vec<TreePoint> {
-    (0..position.len()).map(|i| TreePoint { at: position.row(i), index: i as u32 }).collect()
+    (0..position.len()).map(|i| TreePoint { position: position.row(i), index: i as u32 }).collect()
 }
 
 fn by_voxels(position: &AttributeValues, epsilon: f64) -> usize {
     let index = PointIndex::new(points(position), epsilon);
     let mut search = index.search();
-    index.points().iter().map(|point| search.nearest(point.index, point.at, NEIGHBORS).0.len()).sum()
+    index.points().iter().map(|point| search.nearest(point.index, point.position, NEIGHBORS).0.len()).sum()
 }
 
 fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {

@@ -49,13 +49,13 @@ impl Ids<'_> {
 pub struct ReadPlan {
     /// Frames that will be read, in increasing order; `None` means every frame.
     frames: Option<Arc<[usize]>>,
-    held: usize,
+    max_kept_frames: usize,
 }
 
 impl ReadPlan {
     /// Creates the plan to read every frame in order. A reader that is given no plan assumes this one.
     pub fn all_frames() -> ReadPlan {
-        ReadPlan { frames: None, held: usize::MAX }
+        ReadPlan { frames: None, max_kept_frames: usize::MAX }
     }
 
     /// Creates the plan to read each of `frames` once, in increasing order. The order of `frames` and repetitions in it
@@ -64,20 +64,20 @@ impl ReadPlan {
         let mut frames: Vec<usize> = frames.into_iter().collect();
         frames.sort_unstable();
         frames.dedup();
-        ReadPlan { frames: Some(frames.into()), held: usize::MAX }
+        ReadPlan { frames: Some(frames.into()), max_kept_frames: usize::MAX }
     }
 
     /// Returns a copy of this plan in which a reader keeps at most `frames` frames (at least 1) in memory. A reader
     /// that decodes a tile gets several consecutive frames at once, and keeps them for later reads. A small limit saves
     /// memory but makes the reader decode tiles repeatedly.
     pub fn with_max_kept_frames(self, frames: usize) -> ReadPlan {
-        ReadPlan { held: frames.max(1), ..self }
+        ReadPlan { max_kept_frames: frames.max(1), ..self }
     }
 
     /// Returns the maximum number of frames that a reader keeps in memory after it has decoded a tile, for later reads.
     /// Decoding a tile gives the values of several consecutive frames at once.
     pub fn max_kept_frames(&self) -> usize {
-        self.held
+        self.max_kept_frames
     }
 
     /// Returns the planned frames from `frame` (inclusive) to `end` (exclusive), or `frame` alone if it is not in the
@@ -96,7 +96,7 @@ impl ReadPlan {
     pub fn next_planned(&self, frame: usize) -> Option<usize> {
         match &self.frames {
             None => Some(frame),
-            Some(frames) => frames.get(frames.partition_point(|&wanted| wanted < frame)).copied(),
+            Some(frames) => frames.get(frames.partition_point(|&planned| planned < frame)).copied(),
         }
     }
 }
@@ -143,10 +143,10 @@ impl Sub for ReadCounts {
 pub struct SharedCounter(AtomicU64);
 
 impl SharedCounter {
-    /// Adds `more` to the count.
-    pub fn add(&self, more: u64) {
+    /// Adds `amount` to the count.
+    pub fn add(&self, amount: u64) {
         // Relaxed ordering suffices: the sum is read after reading has finished.
-        self.0.fetch_add(more, Ordering::Relaxed);
+        self.0.fetch_add(amount, Ordering::Relaxed);
     }
 
     /// Returns the sum so far.
@@ -173,7 +173,7 @@ pub trait FrameSource: Send + Sync {
 
     /// Opens a reader that returns all Gaussians at the frames of the plan `_wanted`. It may take more memory per
     /// Gaussian than readers of blocks. Returns `None` if reading block by block takes less time.
-    fn open_all(&self, _wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, _plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
     }
 
@@ -269,7 +269,7 @@ pub trait BlockReader: Send {
 
     /// Announces the frames that will be read from now on. The plan `_wanted` lists them and limits how many of them
     /// the reader may keep in memory. Readers that keep no frames ignore the plan.
-    fn expect(&mut self, _wanted: &ReadPlan) {}
+    fn expect(&mut self, _plan: &ReadPlan) {}
 
     /// Decodes the attributes `_want` at frame `_frame`, and at the other frames of the same tile (frames that are
     /// stored and decoded together), so that later calls of [`BlockReader::read`] only have to copy values. Decodes

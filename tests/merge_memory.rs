@@ -38,7 +38,7 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let container = Container::open(&path).unwrap();
     let ids: Vec<u32> = (0..COUNT as u32).collect();
     let reference = gather(&container, &ids, 0, Attributes::POSITION).unwrap().position;
-    let point = |&index: &u32| TreePoint { at: reference.row(index as usize), index };
+    let point = |&index: &u32| TreePoint { position: reference.row(index as usize), index };
     let index = PointIndex::new(ids.iter().map(point).collect(), f64::INFINITY);
     let mut search = index.search();
     let mut pairs = Vec::new();

@@ -330,19 +330,19 @@ impl CurveDistances {
         CurveDistances { high: SymbolModel::NEW, low: [const { SymbolModel::NEW }; 4] }
     }
 
-    /// Writes a distance along the Morton curve to `to`, and adapts the entropy models to it.
-    fn encode(&mut self, distance: u64, to: &mut SymbolEncoder) {
+    /// Writes a distance along the Morton curve to `encoder`, and adapts the entropy models to it.
+    fn encode(&mut self, distance: u64, encoder: &mut SymbolEncoder) {
         let length = 64 - distance.leading_zeros();
-        to.symbol(&mut self.high, length as usize / SYMBOLS);
-        to.symbol(&mut self.low[length as usize / SYMBOLS], length as usize % SYMBOLS);
-        to.long_bits(distance, length.saturating_sub(1));
+        encoder.symbol(&mut self.high, length as usize / SYMBOLS);
+        encoder.symbol(&mut self.low[length as usize / SYMBOLS], length as usize % SYMBOLS);
+        encoder.long_bits(distance, length.saturating_sub(1));
     }
 
-    /// Reads a distance along the Morton curve from `from`, and adapts the entropy models to it.
-    fn decode(&mut self, from: &mut SymbolDecoder<'_>) -> u64 {
-        let high = from.symbol(&mut self.high) & 3;
-        let length = (high * SYMBOLS + from.symbol(&mut self.low[high])) as u32;
-        let below = from.long_bits(length.saturating_sub(1));
+    /// Reads a distance along the Morton curve from `decoder`, and adapts the entropy models to it.
+    fn decode(&mut self, decoder: &mut SymbolDecoder<'_>) -> u64 {
+        let high = decoder.symbol(&mut self.high) & 3;
+        let length = (high * SYMBOLS + decoder.symbol(&mut self.low[high])) as u32;
+        let below = decoder.long_bits(length.saturating_sub(1));
         if length == 0 { 0 } else { 1 << (length - 1) | below }
     }
 }
@@ -352,7 +352,7 @@ impl CurveDistances {
 struct PlaneCoder {
     /// Values of the two planes (scalar components of all Gaussians) coded last, the most recent one first: one value
     /// per Gaussian, minus the mean of its plane.
-    known: [Vec<f32>; 2],
+    previous_planes: [Vec<f32>; 2],
     /// For each Gaussian: moving average, over the planes coded so far, of the absolute prediction error of its values,
     /// in quantization steps.
     sizes: Vec<f32>,
@@ -365,7 +365,7 @@ impl PlaneCoder {
     /// Creates the coder of the planes (scalar components) of `count` Gaussians. No plane has been coded yet.
     fn new(count: usize) -> PlaneCoder {
         let none = || vec![0.0; count];
-        PlaneCoder { known: [none(), none()], sizes: none(), group: usize::MAX, models: Residuals::new() }
+        PlaneCoder { previous_planes: [none(), none()], sizes: none(), group: usize::MAX, models: Residuals::new() }
     }
 
     /// Codes one plane (scalar component of all Gaussians): calls `code` once for each Gaussian, in coding order.
@@ -391,19 +391,19 @@ impl PlaneCoder {
             (self.group, self.models) = (group, Residuals::new());
         }
         let mean = grid.value(mean);
-        let [one, two] = &mut self.known;
+        let [previous, second_previous] = &mut self.previous_planes;
         let (mut last, mut size) = ([0.0f32; 4], 0.0f32);
-        for (i, own) in self.sizes.iter_mut().enumerate() {
+        for (i, mean_error) in self.sizes.iter_mut().enumerate() {
             let mean_of_four = (last[0] + last[1] + last[2] + last[3]) * 0.25;
-            let around = [last[0], mean_of_four, one[i], two[i]];
-            let (multiple, residual) = code(i, &around, (size + *own) * 0.5, &mut self.models);
+            let around = [last[0], mean_of_four, previous[i], second_previous[i]];
+            let (multiple, residual) = code(i, &around, (size + *mean_error) * 0.5, &mut self.models);
             let off = residual.unsigned_abs() as f32;
             last = [grid.value(multiple) - mean, last[0], last[1], last[2]];
             size = size * 0.75 + off * 0.25;
-            *own = *own * 0.75 + off * 0.25;
-            two[i] = last[0];
+            *mean_error = *mean_error * 0.75 + off * 0.25;
+            second_previous[i] = last[0];
         }
-        std::mem::swap(one, two);
+        std::mem::swap(previous, second_previous);
     }
 }
 

@@ -84,36 +84,36 @@ impl QuantizedTensor<'_> {
     }
 
     /// Encodes the values `data` with the predictor weights `weights` and the entropy models `models`, and writes the
-    /// symbols to `to`. Replaces `data` by the values that a decoder restores.
+    /// symbols to `encoder`. Replaces `data` by the values that a decoder restores.
     pub(super) fn encode(
         &self,
         weights: &PredictorWeights<NEIGHBORS>,
         models: &mut Residuals,
         data: &mut [f32],
-        to: &mut SymbolEncoder,
+        encoder: &mut SymbolEncoder,
     ) {
         let factors = factors(weights);
         self.code_data(data, |_, value, context, grid| {
             let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
             let multiple = grid.multiple(value);
-            let residual = models.encode(multiple, predicted, context.size, to);
+            let residual = models.encode(multiple, predicted, context.size, encoder);
             (grid.value(multiple), residual.unsigned_abs() as f32)
         });
     }
 
-    /// Decodes values from `from` into `data`. `weights` and `models` must equal those with which
+    /// Decodes values from `decoder` into `data`. `weights` and `models` must equal those with which
     /// [`QuantizedTensor::encode`] was called.
     pub(super) fn decode(
         &self,
         weights: &PredictorWeights<NEIGHBORS>,
         models: &mut Residuals,
         data: &mut [f32],
-        from: &mut SymbolDecoder<'_>,
+        decoder: &mut SymbolDecoder<'_>,
     ) {
         let factors = factors(weights);
         self.code_data(data, |_, _, context, grid| {
             let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
-            let (multiple, residual) = models.decode(predicted, context.size, from);
+            let (multiple, residual) = models.decode(predicted, context.size, decoder);
             (grid.value(multiple), residual.unsigned_abs() as f32)
         });
     }

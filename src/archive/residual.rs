@@ -71,7 +71,7 @@ impl Residuals {
         &mut self.signs[offset][(class - 1).min(SIGN_CONTEXTS - 1)]
     }
 
-    /// Encodes the value `multiple`, an integer multiple of the quantization step, into `to`. `predicted` is its
+    /// Encodes the value `multiple`, an integer multiple of the quantization step, into `encoder`. `predicted` is its
     /// prediction. `size`, the expected magnitude of the prediction error in quantization steps, selects the entropy
     /// model. Returns the prediction error in quantization steps.
     pub(super) fn encode(
@@ -79,25 +79,25 @@ impl Residuals {
         multiple: i64,
         predicted: PredictedMultiple,
         size: f32,
-        to: &mut SymbolEncoder,
+        encoder: &mut SymbolEncoder,
     ) -> i64 {
         let residual = multiple - predicted.multiple;
         let magnitude = residual.unsigned_abs();
         let class = CLASSES.iter().rposition(|&(first, _)| first <= magnitude).unwrap_or(0);
-        to.symbol(self.model_for_size(size), class);
+        encoder.symbol(self.model_for_size(size), class);
         let above = magnitude - CLASSES[class].0;
         if class == SYMBOLS - 1 {
-            to.number(above);
+            encoder.number(above);
         } else {
-            to.bits(above, CLASSES[class].1);
+            encoder.bits(above, CLASSES[class].1);
         }
         if class > 0 {
-            to.bit(self.sign_model(predicted.offset, class), residual < 0);
+            encoder.bit(self.sign_model(predicted.offset, class), residual < 0);
         }
         residual
     }
 
-    /// Decodes a value, an integer multiple of the quantization step, from `from`. `predicted` is its prediction.
+    /// Decodes a value, an integer multiple of the quantization step, from `decoder`. `predicted` is its prediction.
     /// `size`, the expected magnitude of the prediction error in quantization steps, selects the entropy model. Returns
     /// the multiple and the prediction error, both in quantization steps.
     #[inline(always)]
@@ -105,16 +105,16 @@ impl Residuals {
         &mut self,
         predicted: PredictedMultiple,
         size: f32,
-        from: &mut SymbolDecoder<'_>,
+        decoder: &mut SymbolDecoder<'_>,
     ) -> (i64, i64) {
-        let class = from.symbol(self.model_for_size(size));
+        let class = decoder.symbol(self.model_for_size(size));
         if class == 0 {
             return (predicted.multiple, 0);
         }
         let (first, bits) = CLASSES[class];
-        let above = if class == SYMBOLS - 1 { from.number() } else { from.bits(bits) };
+        let above = if class == SYMBOLS - 1 { decoder.number() } else { decoder.bits(bits) };
         let magnitude = first.wrapping_add(above) as i64;
-        let is_negative = from.bit(self.sign_model(predicted.offset, class));
+        let is_negative = decoder.bit(self.sign_model(predicted.offset, class));
         let residual = if is_negative { magnitude.wrapping_neg() } else { magnitude };
         (predicted.multiple.wrapping_add(residual), residual)
     }

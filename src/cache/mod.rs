@@ -43,7 +43,7 @@ pub struct CacheRequest {
     pub folder: PathBuf,
     /// Shard (part of a divided stage) to which the run is limited. The run computes this shard of the next stage that
     /// can be divided, then ends. `None`: the run computes everything.
-    pub part: Option<Shard>,
+    pub shard: Option<Shard>,
 }
 
 /// Cache of stage results in a work folder. Without a work folder, nothing is stored. Also holds the shard (part of a
@@ -51,7 +51,7 @@ pub struct CacheRequest {
 #[derive(Debug, Default)]
 pub struct Cache {
     dir: Option<CacheDir>,
-    part: Option<Shard>,
+    shard: Option<Shard>,
     /// Cache key made from the ids of Gaussians that are excluded from the input; `None`: none are excluded.
     excluded_ids_key: Mutex<Option<CacheKey>>,
     notes: Mutex<Vec<String>>,
@@ -71,7 +71,7 @@ impl Cache {
     pub fn open(request: &CacheRequest, about: String) -> Result<Cache> {
         Ok(Cache {
             dir: Some(CacheDir::open_or_create(&request.folder, about)?),
-            part: request.part,
+            shard: request.shard,
             ..Cache::default()
         })
     }
@@ -161,7 +161,7 @@ impl Cache {
     /// # Errors
     /// Fails with [`Error::ShardDone`] if the run is limited to one shard.
     pub fn end_shard_run_before(&self, stage: &str) -> Result<()> {
-        match self.part {
+        match self.shard {
             None => Ok(()),
             Some(part) => Err(Error::ShardDone(format!(
                 "part {part}: nothing left to do; the next stage, {stage}, is not divided: run without --shard"
@@ -242,7 +242,7 @@ impl Cache {
     /// Returns `whole`, the full result of `stage`. Only in a run that is limited to shard 1 of 1 (the whole stage as a
     /// single part), fails with [`Error::ShardDone`] instead: such a run ends when this stage is done.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
-        match self.part {
+        match self.shard {
             Some(Shard::WHOLE) => {
                 Err(Error::ShardDone(format!("{stage}: part {} is done; it is the whole stage", Shard::WHOLE)))
             }
@@ -276,7 +276,7 @@ impl Cache {
         if let Some((&count, _)) = stored.iter().find(|(count, parts)| parts.len() == **count) {
             return Ok(count);
         }
-        let Some(part) = self.part else {
+        let Some(part) = self.shard else {
             let Some((&count, parts)) = stored.iter().max_by_key(|(count, parts)| parts.len() * MAX_SHARDS / **count)
             else {
                 self.note_unusable_shards(dir, stage, key)?;

@@ -4,7 +4,7 @@ use std::fs;
 use super::*;
 
 fn request(folder: &Path, part: Option<&str>) -> CacheRequest {
-    CacheRequest { folder: folder.join("work"), part: part.map(|part| part.parse().unwrap()) }
+    CacheRequest { folder: folder.join("work"), shard: part.map(|part| part.parse().unwrap()) }
 }
 
 fn open_cache(folder: &Path, part: Option<&str>) -> Cache {

@@ -387,7 +387,7 @@ fn view_set(named: SplitArg) -> ViewSet {
 
 /// Returns the cache folder and the shard (part of a divided stage) that the arguments name; `None` without `--cache`.
 pub(super) fn cache_request(cache_args: CacheArgs) -> Option<CacheRequest> {
-    cache_args.cache.map(|folder| CacheRequest { folder, part: cache_args.shard })
+    cache_args.cache.map(|folder| CacheRequest { folder, shard: cache_args.shard })
 }
 
 /// Returns the library's memory settings: the memory limit, and whether the memory plan is printed. If a limit is

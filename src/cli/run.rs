@@ -172,7 +172,7 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     evaluate.original.work = cache_request(args.cache_args);
     let options = ReportOptions {
         evaluate,
-        more: args.more,
+        further_compressed: args.more,
         sweep: args.sweep,
         precision: args.precision,
         render_time: args.render_time,

@@ -171,7 +171,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
             csv: None,
             overwrite: Replace::Never,
         },
-        more: vec![folder.join(COMPRESSED_20X_FILE), folder.join(PRUNED_10X_FILE)],
+        further_compressed: vec![folder.join(COMPRESSED_20X_FILE), folder.join(PRUNED_10X_FILE)],
         sweep: None,
         precision: None,
         render_time: false,

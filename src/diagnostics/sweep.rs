@@ -77,7 +77,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     steps.sort_unstable();
     steps.dedup();
 
-    let (mut found, name) = prepare(options)?;
+    let (mut trade_off, name) = prepare(options)?;
     let run = WholeRun {
         input: &options.input,
         scratch: &staged.path().join("point"),
@@ -96,40 +96,42 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
         .collect();
     let progress = options.input.events.task("sweep", "points", (points.len() + steps.len()) as u64);
     for (method, fraction) in points {
-        if !exceeds_merging(method, fraction, &found) {
-            let point = measure(&run, method, fraction, &method.kind()?, &mut found)?;
-            found.points.push(point);
+        if !exceeds_merging(method, fraction, &trade_off) {
+            let point = measure(&run, method, fraction, &method.kind()?, &mut trade_off)?;
+            trade_off.points.push(point);
         }
         progress.advance(1);
     }
     let mut settings = Vec::with_capacity(steps.len());
     for value in steps {
         let (method, fraction) = (Method::Default, Some(options.steps_at));
-        let point = measure(&run, method, fraction, &refining_by(value)?, &mut found)?;
+        let point = measure(&run, method, fraction, &refining_by(value)?, &mut trade_off)?;
         settings.push(EffortSetting { value, point });
         progress.advance(1);
     }
     if !settings.is_empty() {
-        found.knobs.push(EffortCurve { parameter: STEPS.to_owned(), settings });
+        trade_off.knobs.push(EffortCurve { parameter: STEPS.to_owned(), settings });
     }
-    if let Some(least) = merge_only_count(&found) {
+    if let Some(merged_count) = merge_only_count(&trade_off) {
         let name = Method::PaperMerge.name();
-        found.notes.push(format!("{name}: merging alone leaves {least} Gaussians, so it has no smaller points"));
+        trade_off
+            .notes
+            .push(format!("{name}: merging alone leaves {merged_count} Gaussians, so it has no smaller points"));
     }
     let write = |name: &str, text: String| {
         let path = staged.path().join(name);
         fs::write(&path, text).map_err(Error::io("write", &path))
     };
-    write("sweep.csv", found.csv())?;
-    if !found.knobs.is_empty() {
-        write("knobs.csv", found.knobs_csv())?;
+    write("sweep.csv", trade_off.csv())?;
+    if !trade_off.knobs.is_empty() {
+        write("knobs.csv", trade_off.knobs_csv())?;
     }
-    write("sweep.json", found.json())?;
-    write(PAGE_FILE, page(&found))?;
+    write("sweep.json", trade_off.json())?;
+    write(PAGE_FILE, page(&trade_off))?;
     // The marker file lets a later run recognize the folder as one that it may replace.
-    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
+    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": trade_off.tool })))?;
     staged.commit()?;
-    Ok(found)
+    Ok(trade_off)
 }
 
 /// Opens the input. Returns two values:
@@ -138,7 +140,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
 fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&with_training_views(&options.input))?;
     let name = result_name(&scene)?;
-    let found = TradeOff {
+    let trade_off = TradeOff {
         tool: TOOL.to_owned(),
         path: name_of(&scene.path),
         digest: scene.input.digest()?,
@@ -152,13 +154,14 @@ fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
         knobs: Vec::new(),
         notes: scene.notes,
     };
-    Ok((found, name))
+    Ok((trade_off, name))
 }
 
 /// Returns the number of Gaussians that remain after merging without pruning, according to the points in `trade_off`.
 /// Returns `None` if merging without pruning has not been measured yet.
 fn merge_only_count(trade_off: &TradeOff) -> Option<usize> {
-    let is_merge_only = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
+    let is_merge_only =
+        |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.requested_fraction.is_none();
     trade_off.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
@@ -166,9 +169,11 @@ fn merge_only_count(trade_off: &TradeOff) -> Option<usize> {
 /// pruning, and the points in `trade_off` show that merging alone leaves more Gaussians than this fraction. Such a run
 /// is skipped.
 fn exceeds_merging(method: Method, fraction: Option<f64>, trade_off: &TradeOff) -> bool {
-    let wanted =
+    let requested_count =
         fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * trade_off.gaussians as f64);
-    wanted.zip(merge_only_count(trade_off)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
+    requested_count
+        .zip(merge_only_count(trade_off))
+        .is_some_and(|(requested_count, merged_count)| requested_count.round() < merged_count as f64)
 }
 
 /// Measures one point of the trade-off curves by complete runs of `method`, and returns it. `method_kind`: recipe or
@@ -186,7 +191,7 @@ fn measure(
     let means = evaluation.loss.overall;
     Ok(TradeOffPoint {
         method: method.name().to_owned(),
-        asked: fraction,
+        requested_fraction: fraction,
         count: evaluation.count.compressed,
         bytes: evaluation.bytes.compressed,
         psnr: means.psnr,

@@ -253,7 +253,7 @@ impl ModelPair {
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
     pub fn evaluate_as_first_stage(&self) -> Result<Evaluation> {
-        let compute = |range| Ok(self.scores(range, |_, _, _| ())?.0);
+        let compute = |range| Ok(self.compare_views(range, |_, _, _| ())?.0);
         self.evaluation(self.compute_sharded(NAME, compute)?)
     }
 
@@ -267,8 +267,8 @@ impl ModelPair {
         &self,
         observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
     ) -> Result<(Evaluation, Vec<O>)> {
-        let (scores, observed) = self.scores(0..self.views.len(), observe)?;
-        Ok((self.evaluation(scores)?, observed))
+        let (qualities, observed) = self.compare_views(0..self.views.len(), observe)?;
+        Ok((self.evaluation(qualities)?, observed))
     }
 
     /// Renders every view and returns the values of `observe` for all views, in order. Arguments of `observe`: the
@@ -284,17 +284,17 @@ impl ModelPair {
     ) -> Result<Vec<O>> {
         self.compute_sharded(name, |range| {
             let progress = self.scene.events.task(name, "views", range.len() as u64);
-            let mut all = Vec::with_capacity(range.len());
+            let mut values = Vec::with_capacity(range.len());
             self.for_each_batch(&self.views[range], |views| {
                 let observe_view = |view: &RenderableView<'_, 2>| {
-                    let seen = observe(view.states[0], view.camera, &self.render_view(view)?);
+                    let value = observe(view.states[0], view.camera, &self.render_view(view)?);
                     progress.advance(1);
-                    Ok(seen)
+                    Ok(value)
                 };
-                all.extend(views.par_iter().map(observe_view).collect::<Result<Vec<O>>>()?);
+                values.extend(views.par_iter().map(observe_view).collect::<Result<Vec<O>>>()?);
                 Ok(())
             })?;
-            Ok(all)
+            Ok(values)
         })
     }
 
@@ -308,31 +308,31 @@ impl ModelPair {
         let work = &self.scene.work;
         let key = self.key()?;
         work.compute_in_shards(name, key, self.views.len(), compute, |parts| {
-            let mut all = Vec::with_capacity(self.views.len());
+            let mut values = Vec::with_capacity(self.views.len());
             for part in parts {
-                all.extend(part?);
+                values.extend(part?);
             }
-            Ok(all)
+            Ok(values)
         })
     }
 
-    /// Builds the evaluation from `scores`, the quality measures of all views in order.
-    fn evaluation(&self, scores: Vec<PairScores>) -> Result<Evaluation> {
+    /// Builds the evaluation from `qualities`, the quality measures of all views in order.
+    fn evaluation(&self, qualities: Vec<FrameViewQuality>) -> Result<Evaluation> {
         let times = &self.scene.source().info().times;
-        let view_scores = |(&FrameView { frame, view, .. }, (loss, truth))| ViewQuality {
+        let with_view = |(&FrameView { frame, view, .. }, (loss, truth))| ViewQuality {
             frame,
             time: times[frame],
             view,
             loss,
             truth,
         };
-        let scores: Vec<ViewQuality> = self.views.iter().zip(scores).map(view_scores).collect();
+        let view_qualities: Vec<ViewQuality> = self.views.iter().zip(qualities).map(with_view).collect();
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
                 folder: folder.to_string_lossy().into_owned(),
                 compared_views: self.views.len(),
-                compressed: Comparison::from_views(&scores, |view| Some(view.truth?.compressed))?,
-                original: Comparison::from_views(&scores, |view| Some(view.truth?.original))?,
+                compressed: Comparison::from_views(&view_qualities, |view| Some(view.truth?.compressed))?,
+                original: Comparison::from_views(&view_qualities, |view| Some(view.truth?.original))?,
             })
         });
         let scene = &self.scene;
@@ -354,13 +354,13 @@ impl ModelPair {
                 pairs: self.views.len(),
             },
             background: self.background,
-            loss: Comparison::from_views(&scores, |view| Some(view.loss)).expect("every view has this score"),
-            rig_sides: InsideOutsideMeans::from_views(&scores, &self.outside_views()),
+            loss: Comparison::from_views(&view_qualities, |view| Some(view.loss)).expect("every view has this score"),
+            rig_sides: InsideOutsideMeans::from_views(&view_qualities, &self.outside_views()),
             ground_truth,
             render_ms: None,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             work_notes: scene.work.take_notes(),
-            views: scores,
+            views: view_qualities,
         })
     }
 
@@ -383,9 +383,10 @@ impl ModelPair {
         Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
-    /// Renders the views with the indices `places` in [`Evaluation::views`] again, and calls `see` for each of them.
-    /// `places` may have any order. Arguments of `see`: the index, the frame state of the original, the camera, and the
-    /// images of the view. Returns the values of `see`, sorted by the index, with one value per different index.
+    /// Renders the views with the indices `places` in [`Evaluation::views`] again, and calls `observe` for each of
+    /// them. `places` may have any order. Arguments of `observe`: the index, the frame state of the original, the
+    /// camera, and the images of the view. Returns the values of `observe`, sorted by the index, with one value per
+    /// different index.
     ///
     /// The comparison does not keep its renders for this purpose, because they would take memory that grows with the
     /// numbers of frames and views.
@@ -395,20 +396,20 @@ impl ModelPair {
     pub fn render_views_again<O>(
         &self,
         places: &[usize],
-        mut see: impl FnMut(usize, &Gaussians, &Camera, RenderedViews) -> O,
+        mut observe: impl FnMut(usize, &Gaussians, &Camera, RenderedViews) -> O,
     ) -> Result<Vec<O>> {
         let mut places = places.to_vec();
         places.sort_unstable();
         places.dedup();
         let chosen: Vec<FrameView> = places.iter().map(|&place| self.views[place]).collect();
-        let mut found = Vec::with_capacity(chosen.len());
+        let mut values = Vec::with_capacity(chosen.len());
         self.for_each_batch(&chosen, |views| {
             for view in views {
-                found.push(see(places[found.len()], view.states[0], view.camera, self.render_view(view)?));
+                values.push(observe(places[values.len()], view.states[0], view.camera, self.render_view(view)?));
             }
             Ok(())
         })?;
-        Ok(found)
+        Ok(values)
     }
 
     /// Returns the view at index `place` of [`Evaluation::views`].
@@ -416,27 +417,27 @@ impl ModelPair {
         self.views[place]
     }
 
-    /// Renders `views` with both models and returns one value of `see` per view, in order. Arguments of `see`: the
-    /// render of the original, then that of the compressed model. `views` may be any views of the scene's cameras, and
-    /// must be sorted by frame.
+    /// Renders `views` with both models and returns one value of `observe` per view, in order. Arguments of `observe`:
+    /// the render of the original, then that of the compressed model. `views` may be any views of the scene's cameras,
+    /// and must be sorted by frame.
     ///
     /// # Errors
-    /// Fails if a frame cannot be read or if `see` fails.
+    /// Fails if a frame cannot be read or if `observe` fails.
     pub fn render_pairs<O: Send>(
         &self,
         views: &[FrameView],
-        see: impl Fn([&Image; 2]) -> Result<O> + Sync,
+        observe: impl Fn([&Image; 2]) -> Result<O> + Sync,
     ) -> Result<Vec<O>> {
-        let mut found = Vec::with_capacity(views.len());
+        let mut values = Vec::with_capacity(views.len());
         self.for_each_batch(views, |batch| {
             let compare_view = |view: &RenderableView<'_, 2>| {
                 let images = [0, 1].map(|subject| view.render(subject, self.background));
-                see([&images[0], &images[1]])
+                observe([&images[0], &images[1]])
             };
-            found.extend(batch.par_iter().map(compare_view).collect::<Result<Vec<O>>>()?);
+            values.extend(batch.par_iter().map(compare_view).collect::<Result<Vec<O>>>()?);
             Ok(())
         })?;
-        Ok(found)
+        Ok(values)
     }
 
     /// Measures and returns the median time of rendering one view with each model, milliseconds. The times differ
@@ -468,23 +469,23 @@ impl ModelPair {
     /// values of `observe` (arguments as in [`ModelPair::observe`]) for them. The temporal error of a view needs the
     /// image of the same view at an earlier frame. Therefore, for every view in `range`, its last image before `range`
     /// is first rendered again.
-    fn scores<O: Send>(
+    fn compare_views<O: Send>(
         &self,
         range: Range<usize>,
         observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
-    ) -> Result<(Vec<PairScores>, Vec<O>)> {
+    ) -> Result<(Vec<FrameViewQuality>, Vec<O>)> {
         let mut chosen = previous_views(&self.views, range.start, &self.views[range.clone()]);
-        let again = chosen.len();
+        let repeated_count = chosen.len();
         chosen.extend_from_slice(&self.views[range]);
         let mut last_frame: HashMap<u32, usize> = HashMap::new();
         for view in &chosen {
             last_frame.insert(view.view, view.frame);
         }
-        let mut before: HashMap<u32, RenderedViews> = HashMap::new();
-        let mut all = Vec::with_capacity(chosen.len() - again);
-        let mut observed = Vec::with_capacity(chosen.len() - again);
+        let mut previous: HashMap<u32, RenderedViews> = HashMap::new();
+        let mut qualities = Vec::with_capacity(chosen.len() - repeated_count);
+        let mut observed = Vec::with_capacity(chosen.len() - repeated_count);
         let mut shown = 0;
-        let progress = self.scene.events.task(NAME, "views", (chosen.len() - again) as u64);
+        let progress = self.scene.events.task(NAME, "views", (chosen.len() - repeated_count) as u64);
         self.for_each_batch(&chosen, |views| {
             let first = shown;
             shown += views.len();
@@ -493,30 +494,30 @@ impl ModelPair {
                 .enumerate()
                 .map(|(k, view)| {
                     let rendered = self.render_view(view)?;
-                    if first + k < again {
+                    if first + k < repeated_count {
                         return Ok((rendered, None));
                     }
-                    let scores = rendered.scores(before.get(&view.frame_view.view), self.flip);
-                    let seen = observe(view.states[0], view.camera, &rendered);
+                    let quality = rendered.quality(previous.get(&view.frame_view.view), self.flip);
+                    let value = observe(view.states[0], view.camera, &rendered);
                     progress.advance(1);
-                    Ok((rendered, Some((scores, seen))))
+                    Ok((rendered, Some((quality, value))))
                 })
                 .collect::<Result<_>>()?;
             for (shown, (rendered, found)) in views.iter().zip(rendered) {
                 let FrameView { frame, view, .. } = shown.frame_view;
-                if let Some((scores, seen)) = found {
-                    all.push(scores);
-                    observed.push(seen);
+                if let Some((quality, value)) = found {
+                    qualities.push(quality);
+                    observed.push(value);
                 }
                 if last_frame.get(&view).is_some_and(|&last| last > frame) {
-                    before.insert(view, rendered);
+                    previous.insert(view, rendered);
                 } else {
-                    before.remove(&view);
+                    previous.remove(&view);
                 }
             }
             Ok(())
         })?;
-        Ok((all, observed))
+        Ok((qualities, observed))
     }
 
     /// Renders a view with both models, and reads its photograph if there is one. Returns these images.
@@ -534,18 +535,20 @@ impl ModelPair {
 }
 
 /// Returns the views that must be rendered again before a range of views can be compared: for each view number in
-/// `range`, the last (frame, view) pair with this view number before the range. `all` has the pairs of all images,
-/// sorted by frame. `range` is the part of `all` that begins at the index `start`. The result has the order of `all`.
-fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
-    let mut views: HashSet<u32> = range.iter().map(|view| view.view).collect();
-    let mut last: Vec<FrameView> = all[..start].iter().rev().filter(|view| views.remove(&view.view)).copied().collect();
+/// `range`, the last (frame, view) pair with this view number before the range. `views` has the pairs of all images,
+/// sorted by frame. `range` is the part of `views` that begins at the index `start`. The result has the order of
+/// `views`.
+fn previous_views(views: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
+    let mut view_numbers: HashSet<u32> = range.iter().map(|view| view.view).collect();
+    let mut last: Vec<FrameView> =
+        views[..start].iter().rev().filter(|view| view_numbers.remove(&view.view)).copied().collect();
     last.reverse();
     last
 }
 
 /// Quality measures of one view at one frame. First: quality measures of the compressed model against the original.
 /// Second: quality measures of each model against the photograph, if there is one.
-type PairScores = (ImageQuality, Option<OriginalAndCompressed<ImageQuality>>);
+type FrameViewQuality = (ImageQuality, Option<OriginalAndCompressed<ImageQuality>>);
 
 /// Images of one view at one frame, all of the same size.
 pub struct RenderedViews {
@@ -558,16 +561,17 @@ pub struct RenderedViews {
 }
 
 impl RenderedViews {
-    /// Computes the quality measures of these images. `before`: images of the same view at the previous frame, for the
-    /// temporal error. `with_flip`: whether to compute FLIP.
-    fn scores(&self, before: Option<&RenderedViews>, with_flip: bool) -> PairScores {
+    /// Computes the quality measures of these images. `previous`: images of the same view at the previous frame, for
+    /// the temporal error. `with_flip`: whether to compute FLIP.
+    fn quality(&self, previous: Option<&RenderedViews>, with_flip: bool) -> FrameViewQuality {
         let size = |rendered: &RenderedViews| (rendered.original.width, rendered.original.height);
         // The image size can change with the camera of a view. Then the view has no temporal error.
-        let before = before.filter(|before| size(before) == size(self));
-        let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]), with_flip);
+        let previous = previous.filter(|previous| size(previous) == size(self));
+        let loss =
+            image_quality(&self.compressed, &self.original, previous.map(|b| [&b.compressed, &b.original]), with_flip);
         let truth = self.truth.as_ref().map(|truth| {
             let against = |image: fn(&RenderedViews) -> &Image| {
-                score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
+                image_quality(image(self), truth, previous.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
             };
             OriginalAndCompressed {
                 original: against(|rendered| &rendered.original),
@@ -578,9 +582,9 @@ impl RenderedViews {
     }
 }
 
-/// Computes the quality measures of the image `a` against the image `b`. `before`: images that correspond to `a` and
+/// Computes the quality measures of the image `a` against the image `b`. `previous`: images that correspond to `a` and
 /// `b` at the previous frame of the view; if `None`, no temporal error is computed.
-fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> ImageQuality {
-    let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
+fn image_quality(a: &Image, b: &Image, previous: Option<[&Image; 2]>, with_flip: bool) -> ImageQuality {
+    let temporal = previous.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
     ImageQuality { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
 }

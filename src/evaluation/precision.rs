@@ -178,28 +178,28 @@ pub fn axis_label(error: &str) -> String {
 }
 
 impl PrecisionCurve {
-    /// Creates the curve of the parameter `name` from its measurements `marks`, and computes the observed order of
+    /// Creates the curve of the parameter `name` from its measurements `settings`, and computes the observed order of
     /// every error. Removes infinite errors, which JSON cannot represent.
     /// - `against`: description of the reference values of the errors.
-    /// - `own`: value of the parameter in the recipe.
+    /// - `recipe_value`: value of the parameter in the recipe.
     /// - `expected`: pairs of the name of an error and its order of convergence that theory predicts.
     pub fn new(
         name: &str,
         against: &str,
-        marks: Vec<PrecisionSetting>,
-        own: Option<f64>,
+        settings: Vec<PrecisionSetting>,
+        recipe_value: Option<f64>,
         expected: &[(&str, f64)],
     ) -> PrecisionCurve {
         // JSON cannot represent infinity.
-        let mut marks = marks;
-        marks.iter_mut().for_each(|mark| mark.errors.retain(|_, error| error.is_finite()));
-        let mut names: Vec<String> = marks.iter().flat_map(|mark| mark.errors.keys().cloned()).collect();
+        let mut settings = settings;
+        settings.iter_mut().for_each(|mark| mark.errors.retain(|_, error| error.is_finite()));
+        let mut names: Vec<String> = settings.iter().flat_map(|mark| mark.errors.keys().cloned()).collect();
         names.sort_unstable();
         names.dedup();
         // The error of renders converges to the error of the model itself, not to 0, so it has no order.
         names.retain(|name| name != RENDER_ERROR);
         let order = |error: String| {
-            let points = marks.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&error)?)));
+            let points = settings.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&error)?)));
             let expected = expected.iter().find(|(name, _)| *name == error).map(|&(_, order)| order);
             Some(ObservedOrder { observed: slope(points)?, expected, error })
         };
@@ -207,15 +207,15 @@ impl PrecisionCurve {
         let is_small =
             |mark: &PrecisionSetting| mark.errors.get(ADDED_ERROR).is_some_and(|&added| added < SMALL_ADDED_ERROR);
         // The finest setting is measured against itself, so it does not count.
-        let small = marks.iter().rev().take_while(|mark| is_small(mark)).skip(1).last();
-        let own = own.filter(|own| marks.iter().any(|mark| mark.value == *own));
+        let small = settings.iter().rev().take_while(|mark| is_small(mark)).skip(1).last();
+        let recipe_value = recipe_value.filter(|recipe_value| settings.iter().any(|mark| mark.value == *recipe_value));
         PrecisionCurve {
             name: name.to_owned(),
             reference: against.to_owned(),
             sufficient_value: small.map(|mark| mark.value),
-            settings: marks,
+            settings,
             orders,
-            recipe_value: own,
+            recipe_value,
         }
     }
 }

@@ -179,17 +179,17 @@ pub struct Evaluation {
 }
 
 impl QualityMeans {
-    /// Computes the means of `scores`, the quality measures of views. If `scores` is empty, `pairs` is 0, and PSNR and
-    /// SSIM are NaN, which JSON writes as null.
-    fn from_scores(scores: &[ImageQuality]) -> QualityMeans {
+    /// Computes the means of `qualities`, the quality measures of views. If `qualities` is empty, `pairs` is 0, and
+    /// PSNR and SSIM are NaN, which JSON writes as null.
+    fn from_image_qualities(qualities: &[ImageQuality]) -> QualityMeans {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        let all = |value: fn(&ImageQuality) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
+        let all = |value: fn(&ImageQuality) -> f64| mean(&qualities.iter().map(value).collect::<Vec<_>>());
         let given = |value: fn(&ImageQuality) -> Option<f64>| {
-            let values: Vec<f64> = scores.iter().filter_map(value).collect();
+            let values: Vec<f64> = qualities.iter().filter_map(value).collect();
             (!values.is_empty()).then(|| mean(&values))
         };
         QualityMeans {
-            pairs: scores.len(),
+            pairs: qualities.len(),
             psnr: all(|score| score.psnr),
             ssim: all(|score| score.ssim),
             temporal: given(|score| score.temporal),
@@ -199,38 +199,38 @@ impl QualityMeans {
 }
 
 impl Comparison {
-    /// Averages quality measures over all `view_scores`, over the frames of each view, and over the views of each
-    /// frame. `view_scores` must be sorted by frame. `score` returns the measures of an element of `view_scores`, or
-    /// `None` to leave the element out. Returns `None` if all elements are left out.
+    /// Averages quality measures over all `views`, over the frames of each view, and over the views of each frame.
+    /// `views` must be sorted by frame. `quality` returns the measures of an element of `views`, or `None` to leave the
+    /// element out. Returns `None` if all elements are left out.
     pub fn from_views(
-        view_scores: &[ViewQuality],
-        score: impl Fn(&ViewQuality) -> Option<ImageQuality>,
+        views: &[ViewQuality],
+        quality: impl Fn(&ViewQuality) -> Option<ImageQuality>,
     ) -> Option<Comparison> {
-        let (view_scores, scores): (Vec<&ViewQuality>, Vec<ImageQuality>) =
-            view_scores.iter().filter_map(|view| Some((view, score(view)?))).unzip();
-        if scores.is_empty() {
+        let (views, qualities): (Vec<&ViewQuality>, Vec<ImageQuality>) =
+            views.iter().filter_map(|view| Some((view, quality(view)?))).unzip();
+        if qualities.is_empty() {
             return None;
         }
-        let mut views: BTreeMap<u32, Vec<ImageQuality>> = BTreeMap::new();
-        for (view, &score) in view_scores.iter().zip(&scores) {
-            views.entry(view.view).or_default().push(score);
+        let mut qualities_by_view: BTreeMap<u32, Vec<ImageQuality>> = BTreeMap::new();
+        for (view, &quality) in views.iter().zip(&qualities) {
+            qualities_by_view.entry(view.view).or_default().push(quality);
         }
         let mut per_frame = Vec::new();
-        let mut rest = &scores[..];
-        for frame in view_scores.chunk_by(|a, b| a.frame == b.frame) {
-            let (frame_scores, after) = rest.split_at(frame.len());
+        let mut rest = &qualities[..];
+        for frame in views.chunk_by(|a, b| a.frame == b.frame) {
+            let (frame_qualities, after) = rest.split_at(frame.len());
             per_frame.push(FrameMeans {
                 frame: frame[0].frame,
                 time: frame[0].time,
-                means: QualityMeans::from_scores(frame_scores),
+                means: QualityMeans::from_image_qualities(frame_qualities),
             });
             rest = after;
         }
         Some(Comparison {
-            overall: QualityMeans::from_scores(&scores),
-            per_view: views
+            overall: QualityMeans::from_image_qualities(&qualities),
+            per_view: qualities_by_view
                 .iter()
-                .map(|(&view, scores)| ViewMeans { view, means: QualityMeans::from_scores(scores) })
+                .map(|(&view, qualities)| ViewMeans { view, means: QualityMeans::from_image_qualities(qualities) })
                 .collect(),
             per_frame,
         })
@@ -244,8 +244,8 @@ impl InsideOutsideMeans {
     pub fn from_views(views: &[ViewQuality], is_outside: &[bool]) -> Option<InsideOutsideMeans> {
         let side = |outside: bool| -> Option<QualityMeans> {
             let chosen = views.iter().zip(is_outside).filter(|&(_, &is)| is == outside);
-            let scores: Vec<ImageQuality> = chosen.map(|(view, _)| view.loss).collect();
-            (!scores.is_empty()).then(|| QualityMeans::from_scores(&scores))
+            let qualities: Vec<ImageQuality> = chosen.map(|(view, _)| view.loss).collect();
+            (!qualities.is_empty()).then(|| QualityMeans::from_image_qualities(&qualities))
         };
         Some(InsideOutsideMeans { inside: side(false), outside: side(true)? })
     }
@@ -358,7 +358,7 @@ impl Evaluation {
 mod tests {
     use super::*;
 
-    fn view_scores(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> ViewQuality {
+    fn view_quality(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> ViewQuality {
         let loss = ImageQuality { psnr, ssim: psnr / 100.0, temporal, flip: None };
         ViewQuality { frame, time: frame as f64 / 4.0, view, loss, truth: None }
     }
@@ -366,11 +366,11 @@ mod tests {
     #[test]
     fn means_weigh_views_alike_and_skip_missing_temporal_errors() {
         let scores = [
-            view_scores(0, 1, 30.0, None),
-            view_scores(0, 2, 40.0, None),
-            view_scores(2, 1, 50.0, Some(0.25)),
-            view_scores(2, 7, 20.0, None),
-            view_scores(3, 1, 10.0, Some(0.75)),
+            view_quality(0, 1, 30.0, None),
+            view_quality(0, 2, 40.0, None),
+            view_quality(2, 1, 50.0, Some(0.25)),
+            view_quality(2, 7, 20.0, None),
+            view_quality(3, 1, 10.0, Some(0.75)),
         ];
         let found = Comparison::from_views(&scores, |view| Some(view.loss)).unwrap();
         assert_eq!(found.overall, QualityMeans { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
@@ -408,7 +408,7 @@ mod tests {
 
     #[test]
     fn views_inside_and_outside_the_rig_are_averaged_separately() {
-        let views = [view_scores(0, 1, 30.0, None), view_scores(0, 2, 20.0, None), view_scores(1, 1, 40.0, None)];
+        let views = [view_quality(0, 1, 30.0, None), view_quality(0, 2, 20.0, None), view_quality(1, 1, 40.0, None)];
         let sides = InsideOutsideMeans::from_views(&views, &[false, true, false]).unwrap();
         assert_eq!((sides.inside.unwrap().psnr, sides.outside.psnr, sides.outside.pairs), (35.0, 20.0, 1));
         assert!(InsideOutsideMeans::from_views(&views, &[true; 3]).unwrap().inside.is_none());
@@ -422,7 +422,7 @@ mod tests {
 
     #[test]
     fn csv_matches_the_expected_text() {
-        let mut views = vec![view_scores(0, 1, 30.0, None), view_scores(3, 2, 3e-5, Some(0.25))];
+        let mut views = vec![view_quality(0, 1, 30.0, None), view_quality(3, 2, 3e-5, Some(0.25))];
         assert_eq!(
             evaluation(views.clone()).csv(),
             "frame,view,time,psnr,ssim,temporal\n0,1,0,30,0.3,\n3,2,0.75,0.00003,0.0000003,0.25\n"

@@ -43,7 +43,8 @@ pub struct TradeOffPoint {
     /// Name of the method, as in the option `--methods`.
     pub method: String,
     /// Requested fraction of the Gaussians to keep; `None` if the method chose the number of Gaussians.
-    pub asked: Option<f64>,
+    #[serde(rename = "asked")]
+    pub requested_fraction: Option<f64>,
     /// Number of Gaussians of the compressed model.
     pub count: usize,
     /// Size of the compressed model in bytes, over all its files.
@@ -112,7 +113,7 @@ impl TradeOff {
     fn row(&self, point: &TradeOffPoint) -> Vec<String> {
         vec![
             point.method.clone(),
-            optional_field(point.asked),
+            optional_field(point.requested_fraction),
             point.count.to_string(),
             self.kept_fraction(point).to_string(),
             point.bytes.to_string(),
@@ -138,7 +139,7 @@ impl TradeOff {
             "method", "Gaussians", "kept", "bytes", "PSNR dB", "SSIM", "temporal", "time", "memory"
         );
         for point in &self.points {
-            let more = if point.asked.is_none() { "  (its own choice)" } else { "" };
+            let more = if point.requested_fraction.is_none() { "  (its own choice)" } else { "" };
             let _ = writeln!(out, "  {}{more}", self.line(point));
         }
         for knob in &self.knobs {
@@ -185,7 +186,7 @@ mod tests {
     fn csv_matches_the_expected_text() {
         let point = TradeOffPoint {
             method: "paper".to_owned(),
-            asked: Some(0.5),
+            requested_fraction: Some(0.5),
             count: 6,
             bytes: 1 << 40,
             psnr: f64::INFINITY,
@@ -196,7 +197,7 @@ mod tests {
         };
         let own = TradeOffPoint {
             method: "of \"others\", unknown".to_owned(),
-            asked: None,
+            requested_fraction: None,
             temporal: None,
             peak_memory_bytes: None,
             ..point.clone()

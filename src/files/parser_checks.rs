@@ -26,12 +26,12 @@ pub fn check_pickle(bytes: &[u8], memory: u64) -> Option<usize> {
 /// Fails if the text is not JSON or exceeds the limits on strings, numbers and nesting.
 pub fn check_cameras_json(bytes: &[u8]) -> Result<usize> {
     let path = Path::new("cameras.json");
-    let keep = Keep { wanted: &["frames", "w2c", "transform_matrix"], elements: MAX_ELEMENTS };
+    let keep = Keep { keys: &["frames", "w2c", "transform_matrix"], elements: MAX_ELEMENTS };
     let outline = read_from(bytes, path, &ParseAbort::default(), keep)?;
     let mut found = outline.describe().len().min(1);
-    let wanted = &["w2c", "transform_matrix", "time"];
+    let element_keys = &["w2c", "transform_matrix", "time"];
     for (keys, nested) in [(&[][..], false), (&["frames"][..], false), (&["k", "w2c"][..], true)] {
-        each_element_from(bytes, path, ListSelection { keys, nested, wanted }, |_, value| {
+        each_element_from(bytes, path, ListSelection { keys, nested, element_keys }, |_, value| {
             found += value.describe().len().min(1);
             Ok(())
         })?;

@@ -164,7 +164,7 @@ pub(crate) struct FrameFiles {
     /// Entries of the folder that are files. Each of them is one frame.
     frames: Vec<PathBuf>,
     /// Entries of the folder that are named like frames but are not files, such as folders.
-    others: Vec<PathBuf>,
+    non_files: Vec<PathBuf>,
 }
 
 impl FrameFiles {
@@ -173,16 +173,16 @@ impl FrameFiles {
     /// # Errors
     /// Fails if the folder cannot be listed.
     pub(crate) fn list(folder: &Path, is_frame: impl Fn(&Path) -> bool) -> Result<FrameFiles> {
-        let mut found = Vec::new();
+        let mut paths = Vec::new();
         for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
             let path = entry.map_err(Error::io("list", folder))?.path();
             if is_frame(&path) {
-                found.push(path);
+                paths.push(path);
             }
         }
-        found.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
-        let (frames, others) = found.into_iter().partition(|path| path.is_file());
-        Ok(FrameFiles { frames, others })
+        paths.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
+        let (frames, non_files) = paths.into_iter().partition(|path| path.is_file());
+        Ok(FrameFiles { frames, non_files })
     }
 
     /// Returns the paths of all frames in natural order (`frame_2` before `frame_10`). `folder` is the folder that was
@@ -194,7 +194,7 @@ impl FrameFiles {
         if allow_gaps {
             return Ok(self.frames);
         }
-        if let Some(other) = self.others.first() {
+        if let Some(other) = self.non_files.first() {
             let found = if other.is_dir() { "a folder" } else { "a link to nothing" };
             return Err(Error::input(other, "", "a file, as its name says", found).hint(ALLOW_GAPS_HINT));
         }

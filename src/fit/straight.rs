@@ -12,8 +12,8 @@ pub struct LinearPiece {
     /// Frames in which the piece represents the Gaussian.
     pub frames: Range<usize>,
     /// Time in the middle of the piece. At this time the Gaussian is at `position`.
-    pub at: f64,
-    /// Position at the time `at`, in scene units.
+    pub mid_time: f64,
+    /// Position at the time `mid_time`, in scene units.
     pub position: [f64; 3],
     /// Velocity, scene units per unit of time.
     pub velocity: [f64; 3],
@@ -55,14 +55,14 @@ pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitErr
 /// is invisible in some frames of the span. A span has 2ᵏ frames and may extend beyond the last frame of the track.
 fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
-    let seen = frames.clone().filter(|&frame| track.is_visible(frame)).count();
-    if seen == 0 {
+    let visible_count = frames.clone().filter(|&frame| track.is_visible(frame)).count();
+    if visible_count == 0 {
         return;
     }
-    if seen == frames.len() {
-        let whole = fit_piece(track, frames.clone());
-        if frames.len() == 1 || is_within(track, &whole, tolerance) {
-            return pieces.push(whole);
+    if visible_count == frames.len() {
+        let piece = fit_piece(track, frames.clone());
+        if frames.len() == 1 || is_within(track, &piece, tolerance) {
+            return pieces.push(piece);
         }
     }
     let middle = span.start.midpoint(span.end);
@@ -72,7 +72,7 @@ fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pi
 
 /// Returns the position of the Gaussian at `time` according to `piece`, in scene units.
 fn position_at(piece: &LinearPiece, time: f64) -> [f64; 3] {
-    std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
+    std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.mid_time))
 }
 
 /// Returns the best piece of linear motion for `frames` of `track` (states of a Gaussian at all frames): a least
@@ -80,15 +80,15 @@ fn position_at(piece: &LinearPiece, time: f64) -> [f64; 3] {
 fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let count = frames.len() as f64;
     let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
-    let (at, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
-    let samples = frames.clone().map(|frame| ((track.times[frame] - at) / half, track.position[frame], 1.0));
+    let (mid_time, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
+    let samples = frames.clone().map(|frame| ((track.times[frame] - mid_time) / half, track.position[frame], 1.0));
     let [position, velocity] =
         if frames.len() > 1 { polynomial(samples, 0.0) } else { [track.position[frames.start], [0.0; 3]] };
     let mean = |value: &dyn Fn(usize) -> f64| frames.clone().map(value).sum::<f64>() / count;
     let rotation: [f64; 4] = std::array::from_fn(|c| mean(&|frame| track.rotation[frame][c]));
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
     LinearPiece {
-        at,
+        mid_time,
         position,
         velocity: if frames.len() > 1 { velocity.map(|v| v / half) } else { velocity },
         rotation: if length > 1e-6 { rotation.map(|x| x / length) } else { track.rotation[frames.start] },

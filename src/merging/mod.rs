@@ -354,16 +354,16 @@ fn each_candidate<E>(
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<usize, E> {
     let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
-    let points = usable.map(|node| TreePoint { at: nodes.position(node), index: node as u32 }).collect();
+    let points = usable.map(|node| TreePoint { position: nodes.position(node), index: node as u32 }).collect();
     let index = PointIndex::new(points, pass.epsilon * unit);
     let gates = AppearanceThresholds::new(recipe, pass);
     let find_pairs = |search: &mut NeighborSearch<'_>, leaders: &[TreePoint]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
-        for &TreePoint { at, index: i } in leaders {
+        for &TreePoint { position, index: i } in leaders {
             let (appearance, class) = (nodes.appearance(i as usize), nodes.class(i as usize));
             let passes =
                 |j: u32| nodes.class(j as usize) == class && gates.pass(&appearance, &nodes.appearance(j as usize));
-            let (near, cut) = search.nearest(i, at, recipe.max_neighbors);
+            let (near, cut) = search.nearest(i, position, recipe.max_neighbors);
             truncated += usize::from(cut);
             let behind = near.filter(|&j| rank[i as usize] < rank[j as usize]);
             pairs.extend(behind.filter(|&j| passes(j)).map(|j| (i, j)));

@@ -111,15 +111,15 @@ impl MotionThresholds {
     }
 }
 
-/// Position of a node (Gaussian or merged group) at the present, the previous and the reference frame, and whether it
-/// is alive (opacity ≥ alpha_min) in the present and in the previous frame.
+/// Position of a node (Gaussian or merged group) at the current, the previous and the reference frame, and whether it
+/// is alive (opacity ≥ alpha_min) in the current and in the previous frame.
 #[derive(Debug, Clone, Copy)]
 struct NodeTrack {
     reference: [f32; 3],
-    now: [f32; 3],
-    before: [f32; 3],
+    current: [f32; 3],
+    previous: [f32; 3],
     alive: bool,
-    alive_before: bool,
+    alive_previously: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -156,8 +156,13 @@ impl PairMotionAccumulator {
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
         motion: MotionParams,
     ) -> Self {
-        let track =
-            |reference| NodeTrack { reference, now: reference, before: reference, alive: false, alive_before: false };
+        let track = |reference| NodeTrack {
+            reference,
+            current: reference,
+            previous: reference,
+            alive: false,
+            alive_previously: false,
+        };
         let fresh = NodePair {
             nodes: (0, 0),
             cosines: 0.0,
@@ -180,8 +185,8 @@ impl PairMotionAccumulator {
     /// it is alive (opacity ≥ alpha_min).
     pub fn add_frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
-            (track.before, track.alive_before) = (track.now, track.alive);
-            (track.now, track.alive) = state(i);
+            (track.previous, track.alive_previously) = (track.current, track.alive);
+            (track.current, track.alive) = state(i);
         });
         let steps_end_here = self.frames > 0;
         let (tracks, motion) = (&self.tracks, self.motion);
@@ -193,7 +198,7 @@ impl PairMotionAccumulator {
             }
             pair.common += 1;
             pair.drift(a, b);
-            if steps_end_here && (motion == MotionParams::Literal || (a.alive_before && b.alive_before)) {
+            if steps_end_here && (motion == MotionParams::Literal || (a.alive_previously && b.alive_previously)) {
                 pair.step(a.velocity(), b.velocity());
             }
         });
@@ -224,7 +229,7 @@ impl PairMotionAccumulator {
 
 impl NodeTrack {
     fn velocity(&self) -> DVec3 {
-        wide(self.now) - wide(self.before)
+        wide(self.current) - wide(self.previous)
     }
 }
 
@@ -238,7 +243,7 @@ impl NodePair {
     }
 
     fn drift(&mut self, a: &NodeTrack, b: &NodeTrack) {
-        let change = (wide(a.now) - wide(b.now)) - (wide(a.reference) - wide(b.reference));
+        let change = (wide(a.current) - wide(b.current)) - (wide(a.reference) - wide(b.reference));
         let squared = change.length_squared();
         // A NaN must not be lost by `max`: it counts as an infinite drift.
         self.drift_squared = self.drift_squared.max(if squared.is_nan() { f64::INFINITY } else { squared });

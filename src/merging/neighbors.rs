@@ -66,24 +66,30 @@ impl PointIndex {
     ///
     /// Edge cases: ε = 0 finds exact duplicates; an infinite ε reaches all points.
     pub fn new(mut points: Vec<TreePoint>, epsilon: f64) -> Self {
-        points.retain(|point| point.at.iter().all(|x| x.is_finite()));
+        points.retain(|point| point.position.iter().all(|x| x.is_finite()));
         // Sides are slightly longer than ε. Otherwise rounding could put two points at the exact distance ε into voxels
         // that do not touch.
-        let voxels = VoxelGrid::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * ROUNDING));
+        let voxels = VoxelGrid::around(points.iter().map(|point| point.position), epsilon * (1.0 + 2.0 * ROUNDING));
         let rows: Vec<u32> = (0..points.len() as u32).collect();
-        let order = voxels.sort_rows(&rows, |row| points[row as usize].at);
+        let order = voxels.sort_rows(&rows, |row| points[row as usize].position);
         drop(rows);
         points = order.into_iter().map(|row| points[row as usize]).collect();
-        let number = |point: &TreePoint| voxels.morton_code(point.at);
+        let number = |point: &TreePoint| voxels.morton_code(point.position);
         let in_same_voxel = |a: &TreePoint, b: &TreePoint| number(a) == number(b);
-        let trees: Vec<Tree> =
-            points.par_chunk_by_mut(in_same_voxel).filter(|all| all.len() > MAX_WITHOUT_TREE).map(Tree::new).collect();
+        let trees: Vec<Tree> = points
+            .par_chunk_by_mut(in_same_voxel)
+            .filter(|voxel_points| voxel_points.len() > MAX_WITHOUT_TREE)
+            .map(Tree::new)
+            .collect();
         let mut table = HashTable::with_capacity(points.chunk_by(in_same_voxel).count());
         let (mut start, mut tree) = (0, 0);
-        for all in points.chunk_by(in_same_voxel) {
-            let is_sparse = all.len() <= MAX_WITHOUT_TREE;
-            let voxel = FilledVoxel { start, len: all.len() as u32, tree: if is_sparse { u32::MAX } else { tree } };
-            table.insert_unique(hash(number(&all[0])), voxel, |voxel| hash(number(&points[voxel.start as usize])));
+        for voxel_points in points.chunk_by(in_same_voxel) {
+            let is_sparse = voxel_points.len() <= MAX_WITHOUT_TREE;
+            let voxel =
+                FilledVoxel { start, len: voxel_points.len() as u32, tree: if is_sparse { u32::MAX } else { tree } };
+            table.insert_unique(hash(number(&voxel_points[0])), voxel, |voxel| {
+                hash(number(&points[voxel.start as usize]))
+            });
             start += voxel.len;
             tree += u32::from(!is_sparse);
         }
@@ -102,7 +108,8 @@ impl PointIndex {
     }
 
     fn find_voxel(&self, number: u64) -> Option<FilledVoxel> {
-        let has_number = |voxel: &FilledVoxel| self.voxels.morton_code(self.points[voxel.start as usize].at) == number;
+        let has_number =
+            |voxel: &FilledVoxel| self.voxels.morton_code(self.points[voxel.start as usize].position) == number;
         self.table.find(hash(number), has_number).copied()
     }
 }
@@ -128,19 +135,24 @@ pub struct NeighborSearch<'a> {
 }
 
 impl NeighborSearch<'_> {
-    /// Finds the points nearest to `at`, other than the point with index `query`. Returns the indices of at most `k`
-    /// points within the distance ε, sorted by distance, then by index. Also returns whether more than `k` points are
-    /// within ε.
+    /// Finds the points nearest to `position`, other than the point with index `query_index`. Returns the indices of at
+    /// most `k` points within the distance ε, sorted by distance, then by index. Also returns whether more than `k`
+    /// points are within ε.
     ///
     /// Squared distances are summed in f64 and compared with ε². Edge case: a point that is not finite has no
     /// neighbors.
-    pub fn nearest(&mut self, query: u32, at: [f32; 3], k: usize) -> (impl ExactSizeIterator<Item = u32>, bool) {
+    pub fn nearest(
+        &mut self,
+        query_index: u32,
+        position: [f32; 3],
+        k: usize,
+    ) -> (impl ExactSizeIterator<Item = u32>, bool) {
         let index = self.index;
         // One neighbor more than `k` is sought, to know whether there are more.
-        self.nearest.start_query(query, at, k + 1, index.epsilon);
-        if at.iter().all(|x| x.is_finite()) {
-            let position = index.voxels.grid_coordinates(at);
-            let voxel = voxel_of(position);
+        self.nearest.start_query(query_index, position, k + 1, index.epsilon);
+        if position.iter().all(|x| x.is_finite()) {
+            let grid_position = index.voxels.grid_coordinates(position);
+            let voxel = voxel_of(grid_position);
             if self.last_voxel != Some(voxel) {
                 self.look_up(voxel);
             }
@@ -148,7 +160,7 @@ impl NeighborSearch<'_> {
             // the axes.
             let gap = |part: f64| ((part - ROUNDING).max(0.0) * index.voxels.side()).powi(2);
             let gaps: [[f64; 3]; 3] = std::array::from_fn(|c| {
-                let inside = position[c] - f64::from(voxel[c]);
+                let inside = grid_position[c] - f64::from(voxel[c]);
                 [0.0, gap(inside), gap(1.0 - inside)]
             });
             for &(step, occupied) in &self.around {
@@ -161,8 +173,8 @@ impl NeighborSearch<'_> {
                 }
             }
         }
-        let found = self.nearest.sort_by_distance();
-        (found[..found.len().min(k)].iter().map(|&(_, index)| index), found.len() > k)
+        let neighbors = self.nearest.sort_by_distance();
+        (neighbors[..neighbors.len().min(k)].iter().map(|&(_, index)| index), neighbors.len() > k)
     }
 
     /// Looks up `voxel` and the 26 voxels around it, and remembers those that contain points.
@@ -211,7 +223,7 @@ mod tests {
     use super::*;
 
     fn numbered(points: &[[f32; 3]]) -> Vec<TreePoint> {
-        points.iter().zip(0..).map(|(&at, index)| TreePoint { at, index }).collect()
+        points.iter().zip(0..).map(|(&position, index)| TreePoint { position, index }).collect()
     }
 
     fn found_by_index(points: &[[f32; 3]], k: usize, epsilon: f64) -> Vec<(Vec<u32>, bool)> {
@@ -220,7 +232,7 @@ mod tests {
         numbered(points)
             .iter()
             .map(|point| {
-                let (found, truncated) = search.nearest(point.index, point.at, k);
+                let (found, truncated) = search.nearest(point.index, point.position, k);
                 (found.collect(), truncated)
             })
             .collect()
@@ -320,8 +332,8 @@ mod tests {
         let (index, reversed) = (PointIndex::new(numbered(&points), 0.15), PointIndex::new(reversed, 0.15));
         let (mut search, mut other) = (index.search(), reversed.search());
         for point in numbered(&points) {
-            let (found, cut) = search.nearest(point.index, point.at, 5);
-            let (expected, expected_cut) = other.nearest(point.index, point.at, 5);
+            let (found, cut) = search.nearest(point.index, point.position, 5);
+            let (expected, expected_cut) = other.nearest(point.index, point.position, 5);
             assert!(found.eq(expected) && cut == expected_cut, "{point:?}");
         }
     }
@@ -349,7 +361,7 @@ mod tests {
         let start = Instant::now();
         let index = PointIndex::new(numbered(points), epsilon);
         let query_one = |search: &mut NeighborSearch<'_>, point: &TreePoint| {
-            usize::from(search.nearest(point.index, point.at, k).1)
+            usize::from(search.nearest(point.index, point.position, k).1)
         };
         let cut = index.points().par_iter().map_init(|| index.search(), query_one).sum();
         (start.elapsed().as_secs_f64(), cut)

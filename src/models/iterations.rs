@@ -11,14 +11,14 @@ use crate::error::{Error, Result};
 /// Fails if the folder cannot be listed.
 pub(super) fn iteration_numbers(within: &Path) -> Result<Vec<u32>> {
     let entries = fs::read_dir(within).map_err(Error::io("open", within))?;
-    let mut found = Vec::new();
+    let mut numbers = Vec::new();
     for entry in entries {
         let name = entry.map_err(Error::io("list", within))?.file_name();
         let number = name.to_str().and_then(|name| name.strip_prefix("iteration_"));
-        found.extend(number.and_then(|number| number.parse::<u32>().ok()));
+        numbers.extend(number.and_then(|number| number.parse::<u32>().ok()));
     }
-    found.sort_unstable();
-    Ok(found)
+    numbers.sort_unstable();
+    Ok(numbers)
 }
 
 /// Finds the subfolder `iteration_K` of `within` for the training iteration `requested`, or for the largest K if
@@ -27,13 +27,14 @@ pub(super) fn iteration_numbers(within: &Path) -> Result<Vec<u32>> {
 /// # Errors
 /// Fails if the folder cannot be listed or the requested iteration does not exist; the message lists the existing ones.
 pub(super) fn find_iteration(within: &Path, requested: Option<u32>) -> Result<(u32, PathBuf)> {
-    let found = iteration_numbers(within)?;
-    let chosen = requested.map_or(found.last().copied(), |k| found.contains(&k).then_some(k));
+    let numbers = iteration_numbers(within)?;
+    let chosen = requested.map_or(numbers.last().copied(), |k| numbers.contains(&k).then_some(k));
     let Some(k) = chosen else {
-        let names: Vec<String> = found.iter().map(|k| format!("iteration_{k}")).collect();
+        let names: Vec<String> = numbers.iter().map(|k| format!("iteration_{k}")).collect();
         let available = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-        let wanted = requested.map_or("a folder iteration_<number>".to_owned(), |k| format!("a folder iteration_{k}"));
-        return Err(Error::input(within, "", wanted, available));
+        let expected =
+            requested.map_or("a folder iteration_<number>".to_owned(), |k| format!("a folder iteration_{k}"));
+        return Err(Error::input(within, "", expected, available));
     };
     Ok((k, within.join(format!("iteration_{k}"))))
 }

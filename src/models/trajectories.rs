@@ -157,7 +157,8 @@ fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<
 }
 
 /// Writes the frames of `source` to `path` as `kind`, a kind of output for explicit frames, and returns notes for the
-/// user. Several consecutive frames of `source` may be decoded together; at most `held` of them are kept in memory.
+/// user. Several consecutive frames of `source` may be decoded together; at most `max_kept_frames` of them are kept in
+/// memory.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
@@ -165,14 +166,14 @@ pub fn write_sequence(
     source: &dyn FrameSource,
     kind: OutputKind,
     path: &Path,
-    held: usize,
+    max_kept_frames: usize,
     events: &Events,
 ) -> Result<Vec<String>> {
     let info = source.info();
     match kind {
         OutputKind::Splatv => return Ok(vec![write_fitted_splatv(source, path, events)?]),
         OutputKind::Ftgs | OutputKind::Tsog => return write_fitted_windows(source, kind, path, events),
-        OutputKind::Gsd => return Ok(vec![write_gsd(source, path, held, events)?]),
+        OutputKind::Gsd => return Ok(vec![write_gsd(source, path, max_kept_frames, events)?]),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz | OutputKind::Spz4 => {
             let version = if kind == OutputKind::Spz { SpzVersion::V3 } else { SpzVersion::V4 };
@@ -185,7 +186,7 @@ pub fn write_sequence(
             write_glb(&gather_all(source, 0, Attributes::all())?, path)?;
             return Ok(Vec::new());
         }
-        OutputKind::SogSequence => return write_sog_sequence(source, path, held, events),
+        OutputKind::SogSequence => return write_sog_sequence(source, path, max_kept_frames, events),
         OutputKind::Gseq => {
             let progress = events.task("emit", "states", info.count as u64 * info.times.len() as u64);
             let compression = Compression::Zstd(ZSTD_LEVEL);
@@ -195,7 +196,7 @@ pub fn write_sequence(
         _ => (),
     }
     let progress = events.task("emit", "frames", info.times.len() as u64);
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(max_kept_frames))?;
     for frame in 0..info.times.len() {
         let file = match kind {
             OutputKind::Ply => path.to_owned(),

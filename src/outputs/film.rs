@@ -207,7 +207,7 @@ fn gif_error_to_io(error: gif::EncodingError) -> io::Error {
 struct FrameEncoder {
     child: Child,
     /// Standard input of the encoder process; `None` after it was closed.
-    to: Option<ChildStdin>,
+    stdin: Option<ChildStdin>,
     /// Thread that collects the messages of the encoder process.
     messages: Option<JoinHandle<String>>,
 }
@@ -233,22 +233,22 @@ impl FrameEncoder {
         let mut child = command
             .spawn()
             .map_err(|error| io::Error::new(error.kind(), format!("cannot run {}: {error}", program.shown())))?;
-        let to = child.stdin.take();
-        let messages = child.stderr.take().map(|mut from| {
+        let stdin = child.stdin.take();
+        let messages = child.stderr.take().map(|mut stderr| {
             std::thread::spawn(move || {
                 let mut messages = Vec::new();
-                let _ = from.by_ref().take(MAX_MESSAGE_BYTES).read_to_end(&mut messages);
-                // ReadCounts on, because the encoder would block if nobody read its output.
-                let _ = io::copy(&mut from, &mut io::sink());
+                let _ = stderr.by_ref().take(MAX_MESSAGE_BYTES).read_to_end(&mut messages);
+                // Reads on, because the encoder would block if nobody read its output.
+                let _ = io::copy(&mut stderr, &mut io::sink());
                 String::from_utf8_lossy(&messages).into_owned()
             })
         });
-        Ok(FrameEncoder { child, to, messages })
+        Ok(FrameEncoder { child, stdin, messages })
     }
 
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
-        let Some(to) = &mut self.to else { return Err(io::Error::other(format!("{ENCODER} has ended"))) };
-        match to.write_all(bytes) {
+        let Some(stdin) = &mut self.stdin else { return Err(io::Error::other(format!("{ENCODER} has ended"))) };
+        match stdin.write_all(bytes) {
             // Writing failed because the encoder has ended; its exit status and messages describe the cause.
             Err(_) => Err(self.end().err().unwrap_or_else(|| io::Error::other(format!("{ENCODER} ended too early")))),
             Ok(()) => Ok(()),
@@ -260,7 +260,7 @@ impl FrameEncoder {
     }
 
     fn end(&mut self) -> io::Result<()> {
-        self.to = None;
+        self.stdin = None;
         let status = self.child.wait()?;
         let messages = self.messages.take().and_then(|messages| messages.join().ok()).unwrap_or_default();
         match status.success() {

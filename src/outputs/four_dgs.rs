@@ -135,7 +135,7 @@ fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
     set.rotations.extend([x, y, z, w]);
     set.colors.extend((0..3).map(|c| to_f32(color_from_sh(piece.sh[c]).clamp(0.0, 1.0))));
     set.colors.push(to_f32(piece.opacity));
-    set.mu_t.push(to_f32(piece.at));
+    set.mu_t.push(to_f32(piece.mid_time));
     set.sigma_t.push(f32::INFINITY);
     set.win_lo.push(to_f32(starts[piece.frames.start]));
     set.win_hi.push(to_f32(starts[piece.frames.end]));

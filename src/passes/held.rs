@@ -64,12 +64,12 @@ impl FrameSource for FramesInMemory {
                 _ => runs.push(id..id + 1),
             }
         }
-        Ok(Box::new(HeldReader { held: self, len: ids.len(), runs }))
+        Ok(Box::new(HeldReader { source: self, len: ids.len(), runs }))
     }
 }
 
 struct HeldReader<'a> {
-    held: &'a FramesInMemory,
+    source: &'a FramesInMemory,
     len: usize,
     /// Ids of the Gaussians to read, in the order in which they are returned, as ranges of consecutive ids.
     runs: Vec<Range<usize>>,
@@ -78,8 +78,8 @@ struct HeldReader<'a> {
 impl BlockReader for HeldReader<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
-            let varies = self.held.info.varying.contains(column);
-            let from = if varies { &self.held.frames[frame] } else { &self.held.constant }.attribute_values(column);
+            let varies = self.source.info.varying.contains(column);
+            let from = if varies { &self.source.frames[frame] } else { &self.source.constant }.attribute_values(column);
             let to = out.attribute_values_mut(column);
             to.resize(self.len);
             for c in 0..to.width() {

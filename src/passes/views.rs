@@ -63,7 +63,7 @@ pub struct BatchLimits {
     /// Maximum number of views in a batch (views that are processed together, in parallel).
     pub views: usize,
     /// Maximum number of decoded frames that a reader keeps in memory, for readers that decode several frames together.
-    pub held: usize,
+    pub max_kept_frames: usize,
 }
 
 impl BatchLimits {
@@ -71,14 +71,14 @@ impl BatchLimits {
     /// threads busy.
     fn many_views(limits: &Limits) -> BatchLimits {
         let views = VIEWS_PER_THREAD * rayon::current_num_threads();
-        BatchLimits { frames: limits.frames_together, views, held: limits.max_kept_frames }
+        BatchLimits { frames: limits.frames_together, views, max_kept_frames: limits.max_kept_frames }
     }
 
     /// Returns limits for views whose renders stay in memory until their batch ends: a batch has one frame, and at most
     /// one view per thread.
     pub fn one_frame(limits: &Limits) -> BatchLimits {
         let views = rayon::current_num_threads().min(limits.views_together);
-        BatchLimits { frames: 1, views, held: limits.max_kept_frames }
+        BatchLimits { frames: 1, views, max_kept_frames: limits.max_kept_frames }
     }
 
     /// Returns the number of views at the start of `views` that form the next batch within these limits.
@@ -181,7 +181,7 @@ pub fn for_each_view_batch<const S: usize>(
     max_batch: BatchLimits,
     mut visit: impl FnMut(&[RenderableView<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = ReadPlan::new(views.iter().map(|view| view.frame)).with_max_kept_frames(max_batch.held);
+    let wanted = ReadPlan::new(views.iter().map(|view| view.frame)).with_max_kept_frames(max_batch.max_kept_frames);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);
@@ -312,7 +312,7 @@ mod tests {
             (0..9).map(|frame| gather_all(&scene, frame, Attributes::all()).unwrap()).collect();
         for (frames, max_batch) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
             let mut seen = Vec::new();
-            let batch = BatchLimits { frames, views: max_batch, held: 4 };
+            let batch = BatchLimits { frames, views: max_batch, max_kept_frames: 4 };
             let position = RenderedSource { source: &scene, ids: None, columns: Attributes::POSITION };
             for_each_view_batch(
                 [RenderedSource::all_gaussians(&scene), position],
@@ -373,7 +373,7 @@ mod tests {
         let scene = RayScene(DemoScene::new(200, 3));
         let rig = scene.0.rig();
         let some: Vec<u32> = (0..200).collect();
-        let batch = BatchLimits { frames: 2, views: 4, held: 4 };
+        let batch = BatchLimits { frames: 2, views: 4, max_kept_frames: 4 };
         let few = RenderedSource { source: &scene, ids: Some(Ids::List(&some)), columns: Attributes::all() };
         for_each_view_batch(
             [RenderedSource::all_gaussians(&scene), few],
@@ -413,7 +413,7 @@ mod tests {
         let rig = scene.rig();
         let reads = |views: u32| {
             let before = container.reads();
-            let batch = BatchLimits { frames: 1, views: 2, held: usize::MAX };
+            let batch = BatchLimits { frames: 1, views: 2, max_kept_frames: usize::MAX };
             for_each_view_batch(
                 [RenderedSource::all_gaussians(&container)],
                 &rig.cameras,

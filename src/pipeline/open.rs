@@ -101,7 +101,7 @@ fn send_forecast(
 ) -> Result<()> {
     let tell = options.memory.tell;
     // A process that runs only one shard does not know which fraction of the whole run it does, so it has no forecast.
-    let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
+    let is_part = options.work.as_ref().is_some_and(|work| work.shard.is_some());
     if tell == Verbosity::Plan && stages.output.is_some() {
         options.events.send(Message::Plan(&stages.text()));
     }
@@ -257,9 +257,9 @@ fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &m
     }
 }
 
-/// Returns a virtual rig (cameras placed by the program) around the first frame of `held`, the frames in memory.
-fn rig_around(held: &FramesInMemory) -> Rig {
-    let bounds = RobustBox::from_positions(held.position(0));
+/// Returns a virtual rig (cameras placed by the program) around the first frame of `frames`, the frames in memory.
+fn rig_around(frames: &FramesInMemory) -> Rig {
+    let bounds = RobustBox::from_positions(frames.position(0));
     cameras::virtual_rig(bounds.median, bounds.extent())
 }
 
@@ -272,7 +272,7 @@ struct Measuring<'a> {
     /// frames.
     schedule: ViewSchedule,
     scan: RunningScan<'a>,
-    seen: Option<(ViewSampler, RunningContribution)>,
+    contribution: Option<(ViewSampler, RunningContribution)>,
 }
 
 impl<'a> Measuring<'a> {
@@ -282,7 +282,7 @@ impl<'a> Measuring<'a> {
         split: Option<Split>,
         plan: &'a ScanPlan,
         scan: &recipe::ScanParams,
-        seen: Option<RunningContribution>,
+        contribution: Option<RunningContribution>,
     ) -> Self {
         Measuring {
             plan,
@@ -290,21 +290,24 @@ impl<'a> Measuring<'a> {
             assumed: AssumedTimes::new(rig, split),
             schedule: ViewSchedule::new(rig.cameras.clone()),
             scan: RunningScan::new(count, plan),
-            seen: seen.map(|seen| (ViewSampler::new(scan), seen)),
+            contribution: contribution.map(|contribution| (ViewSampler::new(scan), contribution)),
         }
     }
 
-    fn add(&mut self, held: &FramesInMemory) -> Result<()> {
-        let new: Vec<Vec<(u32, u32)>> = held.info().times.iter().map(|&time| self.assumed.at(time)).collect();
-        new.iter().for_each(|views| self.schedule.push_frames(1, views));
-        let cameras: Vec<Vec<&Camera>> =
-            new.iter().map(|views| views.iter().map(|&(_, camera)| &self.cameras[camera as usize]).collect()).collect();
-        self.scan.add(held, &cameras)?;
-        if let Some((sampler, seen)) = &mut self.seen {
-            let new = new.iter().enumerate();
+    fn add(&mut self, frames: &FramesInMemory) -> Result<()> {
+        let views_per_frame: Vec<Vec<(u32, u32)>> =
+            frames.info().times.iter().map(|&time| self.assumed.at(time)).collect();
+        views_per_frame.iter().for_each(|views| self.schedule.push_frames(1, views));
+        let cameras: Vec<Vec<&Camera>> = views_per_frame
+            .iter()
+            .map(|views| views.iter().map(|&(_, camera)| &self.cameras[camera as usize]).collect())
+            .collect();
+        self.scan.add(frames, &cameras)?;
+        if let Some((sampler, contribution)) = &mut self.contribution {
+            let views_per_frame = views_per_frame.iter().enumerate();
             let views: Vec<FrameView> =
-                new.flat_map(|(frame, views)| sampler.views_of_next_frame(frame, views)).collect();
-            seen.add(held, self.cameras, &views, || ())?;
+                views_per_frame.flat_map(|(frame, views)| sampler.views_of_next_frame(frame, views)).collect();
+            contribution.add(frames, self.cameras, &views, || ())?;
         }
         Ok(())
     }
@@ -319,7 +322,10 @@ impl<'a> Measuring<'a> {
     }
 
     fn finish(self, complete: &ScanPlan) -> Measured {
-        Measured { scanned: self.scan.finish(complete), visible_contribution: self.seen.map(|(_, seen)| seen.finish()) }
+        Measured {
+            scanned: self.scan.finish(complete),
+            visible_contribution: self.contribution.map(|(_, contribution)| contribution.finish()),
+        }
     }
 }
 

@@ -60,23 +60,23 @@ impl<'a> QualityMeter<'a> {
     }
 
     /// Returns the mean PSNR, dB, of renders of the model `source` against the images of the meter (renders of the
-    /// original, or photographs). If `held` is true, uses the views that are held back from the search for the smallest
-    /// model; otherwise uses the views of the search.
+    /// original, or photographs). If `on_held_views` is true, uses the views that are held back from the search for the
+    /// smallest model; otherwise uses the views of the search.
     ///
     /// # Errors
     /// Fails if frames or photographs cannot be read.
-    pub(super) fn measure(&self, source: &dyn FrameSource, held: bool) -> Result<f64> {
+    pub(super) fn measure(&self, source: &dyn FrameSource, on_held_views: bool) -> Result<f64> {
         let background = self.scene.background;
-        let places: Vec<usize> = (0..self.views.len()).filter(|&k| self.views[k].1 == held).collect();
+        let places: Vec<usize> = (0..self.views.len()).filter(|&k| self.views[k].1 == on_held_views).collect();
         let views: Vec<FrameView> = places.iter().map(|&k| self.views[k].0).collect();
-        let mut found = Vec::with_capacity(views.len());
+        let mut psnrs = Vec::with_capacity(views.len());
         for_each_view_batch(
             [RenderedSource::all_gaussians(source)],
             self.cameras,
             &views,
             BatchLimits::one_frame(&self.scene.limits),
             |batch| {
-                let first = found.len();
+                let first = psnrs.len();
                 let view_psnr = |(place, view): (usize, &RenderableView<'_, 1>)| {
                     match &self.comparison {
                         QualityReference::Photographs(photographs) => {
@@ -94,11 +94,11 @@ impl<'a> QualityMeter<'a> {
                     }
                 };
                 let of_batch: Vec<f64> = batch.par_iter().enumerate().map(view_psnr).collect::<Result<_>>()?;
-                found.extend(of_batch);
+                psnrs.extend(of_batch);
                 Ok(())
             },
         )?;
-        Ok(found.iter().sum::<f64>() / found.len() as f64)
+        Ok(psnrs.iter().sum::<f64>() / psnrs.len() as f64)
     }
 
     /// Returns the number of views on which the search for the smallest model compares models. Views that are held back

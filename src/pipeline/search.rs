@@ -33,8 +33,8 @@ use crate::refinement::targets::{Targets, ViewSplit};
 use crate::refinement::{RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
+use crate::scene::add_file_stamps;
 use crate::scene::photographs::Photographs;
-use crate::scene::stamps;
 use crate::scene::view_selection::{ViewSet, select_views};
 use crate::source::FrameSource;
 
@@ -257,7 +257,7 @@ impl SearchStage {
         };
         let mut files = Vec::new();
         if let Some(folder) = folder.filter(|_| scene.work.is_enabled()) {
-            stamps(folder, &mut files)?;
+            add_file_stamps(folder, &mut files)?;
         }
         let refine = self.refine.as_ref().map(RefineStage::key);
         Ok(scene.work.key(&(
@@ -299,20 +299,20 @@ impl SearchStage {
     ///   ranking;
     /// - every tried size with the quality of its model, dB (see [`TriedSize::value`]).
     fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
-        let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
+        let (least, ranked_count) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
         let mut best: Option<TriedSize> = None;
         // Bounds of the search: size `low` fails, size `high` passes. Each has its surplus of quality in halvings, or
         // `None` if the size was not tried.
-        let (mut low, mut high) = ((least.saturating_sub(1), None), (all, None));
-        let mut next = FIRST_FRACTION * all as f64;
+        let (mut low, mut high) = ((least.saturating_sub(1), None), (ranked_count, None));
+        let mut next = FIRST_FRACTION * ranked_count as f64;
         while tried.len() < MAX_SIZES && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE_RATIO * low.0 as f64 {
             let size = (next.round() as usize).clamp(low.0 + 1, high.0 - 1);
-            let now = self.try_size(trial, meter, size)?;
-            let surplus = self.surplus(now.value);
-            tried.push((size, now.value));
+            let tried_size = self.try_size(trial, meter, size)?;
+            let surplus = self.surplus(tried_size.value);
+            tried.push((size, tried_size.value));
             if surplus >= 0.0 {
-                (high, best) = ((size, Some(surplus)), Some(now));
+                (high, best) = ((size, Some(surplus)), Some(tried_size));
                 if surplus <= MAX_SURPLUS {
                     break;
                 }
@@ -331,8 +331,8 @@ impl SearchStage {
         let best = match best {
             Some(best) => best,
             None => {
-                let everything = self.try_size(trial, meter, all)?;
-                tried.push((all, everything.value));
+                let everything = self.try_size(trial, meter, ranked_count)?;
+                tried.push((ranked_count, everything.value));
                 everything
             }
         };
@@ -352,12 +352,18 @@ impl SearchStage {
     }
 
     /// Returns the quality of the model `result`, dB: its PSNR against the original, or its loss of PSNR against
-    /// photographs if a maximum loss is requested. If `held`, measures on the views held back from the search,
+    /// photographs if a maximum loss is requested. If `on_held_views`, measures on the views held back from the search,
     /// otherwise on the views that the search uses.
-    fn value(&self, meter: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
-        let found = meter.measure(result, held)?;
+    fn value(
+        &self,
+        meter: &QualityMeter<'_>,
+        result: &dyn FrameSource,
+        scene: &Scene,
+        on_held_views: bool,
+    ) -> Result<f64> {
+        let found = meter.measure(result, on_held_views)?;
         match self.searched {
-            Quality::Loss { .. } => Ok(meter.measure(scene.source(), held)? - found),
+            Quality::Loss { .. } => Ok(meter.measure(scene.source(), on_held_views)? - found),
             Quality::Psnr(_) => Ok(found),
         }
     }

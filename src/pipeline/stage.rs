@@ -159,39 +159,46 @@ pub struct CountPlan {
 
 impl CountPlan {
     /// Returns the number of Gaussians with which refinement begins. `target_count`: number of Gaussians in the output.
-    /// `all`: number of Gaussians in the input.
-    pub fn count_before_refinement(&self, target_count: usize, all: usize) -> usize {
-        start_count(self.refinement_starts_at, target_count, all)
+    /// `input_count`: number of Gaussians in the input.
+    pub fn count_before_refinement(&self, target_count: usize, input_count: usize) -> usize {
+        start_count(self.refinement_starts_at, target_count, input_count)
     }
 
-    /// Returns the number of Gaussians that ranking leaves. `target_count`: number of Gaussians in the output. `all`:
-    /// number of Gaussians in the input. A search for the smallest model with a requested quality tries several models
-    /// but ranks only once. In such a run the result is the number that the smallest tried model needs, whatever
-    /// `target_count` is.
-    pub fn count_after_ranking(&self, target_count: usize, all: usize) -> usize {
-        let smallest =
-            if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
-        self.count_before_refinement(if self.searches { smallest } else { target_count }, all)
+    /// Returns the number of Gaussians that ranking leaves. `target_count`: number of Gaussians in the output.
+    /// `input_count`: number of Gaussians in the input. A search for the smallest model with a requested quality tries
+    /// several models but ranks only once. In such a run the result is the number that the smallest tried model needs,
+    /// whatever `target_count` is.
+    pub fn count_after_ranking(&self, target_count: usize, input_count: usize) -> usize {
+        let smallest = if self.refinement_starts_at.is_some() {
+            0
+        } else {
+            (SEARCH_RANK_FRACTION * input_count as f64).ceil() as usize
+        };
+        self.count_before_refinement(if self.searches { smallest } else { target_count }, input_count)
     }
 
     /// Returns a line of text for display: how many Gaussians are left after ranking and how many refinement then
-    /// removes. `all` is the number of Gaussians in the input, and `target` the number in the output, if known.
+    /// removes. `input_count` is the number of Gaussians in the input, and `target` the number in the output, if known.
     /// `merges` tells whether survivors (Gaussians that are not removed) are merged.
-    pub(super) fn text(&self, target: Option<usize>, all: usize, merges: bool) -> String {
-        let share =
-            |count: usize| format!("{count} of {all} Gaussians ({:.0}%)", 100.0 * count as f64 / all.max(1) as f64);
+    pub(super) fn text(&self, target: Option<usize>, input_count: usize, merges: bool) -> String {
+        let share = |count: usize| {
+            format!("{count} of {input_count} Gaussians ({:.0}%)", 100.0 * count as f64 / input_count.max(1) as f64)
+        };
         let alone = if merges { "ranking and merging leave" } else { "ranking leaves" };
         match (target, self.refinement_starts_at) {
-            (Some(wanted), Some(_)) => {
-                let ranked = self.count_before_refinement(wanted, all);
-                let removed = ranked - wanted;
-                format!("counts: ranking leaves {}, refinement removes {removed} of them; {wanted} stay", share(ranked))
+            (Some(target_count), Some(_)) => {
+                let ranked = self.count_before_refinement(target_count, input_count);
+                let removed = ranked - target_count;
+                format!(
+                    "counts: ranking leaves {}, refinement removes {removed} of them; {target_count} stay",
+                    share(ranked)
+                )
             }
-            (Some(wanted), None) => format!("counts: {alone} {}; refinement removes none", share(wanted)),
+            (Some(target_count), None) => format!("counts: {alone} {}; refinement removes none", share(target_count)),
             (None, Some(_)) => format!(
                 "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found \
                  during the run",
-                share(self.count_before_refinement(0, all))
+                share(self.count_before_refinement(0, input_count))
             ),
             (None, None) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
         }
@@ -204,7 +211,7 @@ type Estimate = Box<dyn Fn(&Workload, &Limits) -> ResourceEstimate + Send + Sync
 
 /// Stage or step that a run omits, with the reason.
 struct LeftOutStage {
-    what: &'static str,
+    name: &'static str,
     why: String,
     /// Function that estimates the memory, time and reads that omitting the stage saves; `None` if they are not known.
     estimate: Option<Estimate>,
@@ -227,21 +234,21 @@ impl StageList {
         self.stages.push((phase, Box::new(stage)));
     }
 
-    /// Records that the run omits the work `what` (its name for display) for the reason `why`. The memory and time that
+    /// Records that the run omits the work `name` (text for display) for the reason `why`. The memory and time that
     /// this saves are not known.
-    pub fn leave_out(&mut self, what: &'static str, why: impl Into<String>) {
-        self.left_out.push(LeftOutStage { what, why: why.into(), estimate: None });
+    pub fn leave_out(&mut self, name: &'static str, why: impl Into<String>) {
+        self.left_out.push(LeftOutStage { name, why: why.into(), estimate: None });
     }
 
-    /// Records that the run omits the stage `what` (its name for display) for the reason `why`. `estimate` returns the
+    /// Records that the run omits the stage `name` (text for display) for the reason `why`. `estimate` returns the
     /// memory, time and reads that the omission saves.
     pub fn leave_out_stage(
         &mut self,
-        what: &'static str,
+        name: &'static str,
         why: impl Into<String>,
         estimate: impl Fn(&Workload, &Limits) -> ResourceEstimate + Send + Sync + 'static,
     ) {
-        self.left_out.push(LeftOutStage { what, why: why.into(), estimate: Some(Box::new(estimate)) });
+        self.left_out.push(LeftOutStage { name, why: why.into(), estimate: Some(Box::new(estimate)) });
     }
 
     /// Removes the optional stages, which only report something (see [`Stage::is_optional`]).
@@ -279,19 +286,19 @@ impl StageList {
 
     /// Returns one line of text for display per omitted stage, with the reason.
     pub fn omitted_stages_text(&self) -> impl Iterator<Item = String> {
-        self.left_out.iter().map(|left| format!("left out: {} ({})", left.what, left.why))
+        self.left_out.iter().map(|stage| format!("left out: {} ({})", stage.name, stage.why))
     }
 
     /// Adds the omitted stages with their reasons to `journal`, the log of the run. If an estimate exists for a stage,
     /// also adds the time and the reads that are saved, for an input of the sizes `work` and the memory limits
     /// `limits`.
     pub fn record_left_out(&self, work: &Workload, limits: &Limits, journal: &mut Journal) {
-        for LeftOutStage { what, why, estimate } in &self.left_out {
+        for LeftOutStage { name, why, estimate } in &self.left_out {
             match estimate.as_ref().map(|estimate| estimate(work, limits)) {
-                None => journal.leave_out(*what, why),
+                None => journal.leave_out(*name, why),
                 Some(ResourceEstimate { seconds, reads, .. }) => {
                     let seconds = seconds / work.threads as f64;
-                    journal.leave_out_with_saving(*what, why, SavedCost::Stage { seconds, reads });
+                    journal.leave_out_with_saving(*name, why, SavedCost::Stage { seconds, reads });
                 }
             }
         }

@@ -137,7 +137,7 @@ impl ScoreStage {
     }
 
     /// Computes scores and a selection of the Gaussians to keep, from the statistics `scanned` and, if measured, the
-    /// visible contributions `seen`. Notes for the user are added to `journal`.
+    /// visible contributions `visible`. Notes for the user are added to `journal`.
     ///
     /// # Errors
     /// Fails if values are not finite (unless the recipe drops or keeps such Gaussians), if no Gaussian is in any view
@@ -146,16 +146,16 @@ impl ScoreStage {
         &self,
         scene: &Scene,
         scanned: ScanResult,
-        seen: Option<VisibleContribution>,
+        visible: Option<VisibleContribution>,
         journal: &mut Journal,
     ) -> Result<Scored> {
         let source = scene.source();
         let info = source.info();
         let mut rows = scanned.rows;
-        if let Some(seen) = seen {
-            (rows.c, rows.w) = (seen.coverage, seen.peak);
-            let odd: Vec<u32> = non_finite(&rows).collect();
-            for id in odd {
+        if let Some(visible) = visible {
+            (rows.c, rows.w) = (visible.coverage, visible.peak);
+            let non_finite_ids: Vec<u32> = non_finite(&rows).collect();
+            for id in non_finite_ids {
                 rows.clear(id as usize);
             }
         }
@@ -165,10 +165,10 @@ impl ScoreStage {
             if self.snap_noise {
                 snap_noise_to_zero(&mut rows, scanned.largest_coordinate);
             }
-            let all: Vec<u32> = (0..info.count as u32).collect();
+            let all_ids: Vec<u32> = (0..info.count as u32).collect();
             let state = match info.times.is_empty() {
                 true => Gaussians::zeros(info.count, info.sh_degree),
-                false => gather(source, &all, reference_frame, Attributes::POSITION | Attributes::LOG_SCALE)?,
+                false => gather(source, &all_ids, reference_frame, Attributes::POSITION | Attributes::LOG_SCALE)?,
             };
             let extent = RobustBox::from_positions(&state.position).extent();
             let canonical = scene.input.canonical().unwrap_or(&state);
@@ -177,7 +177,7 @@ impl ScoreStage {
             let mut protected = self.user.keep.clone();
             if let Some(corners) = self.user.keep_box {
                 protected
-                    .extend(all.iter().copied().filter(|&id| is_inside(&corners, state.position.row(id as usize))));
+                    .extend(all_ids.iter().copied().filter(|&id| is_inside(&corners, state.position.row(id as usize))));
             }
             let mut drop = self.user.drop.clone();
             let absent = self.non_finite_ids_to_drop(&rows);

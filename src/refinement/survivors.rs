@@ -21,22 +21,22 @@ pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions:
     let mut ranked: Vec<u32> = (0..errors.len() as u32).collect();
     ranked.sort_by_key(|&i| (fixed[i as usize], errors[i as usize], std::cmp::Reverse(i)));
     let candidates = &ranked[..((CANDIDATE_RATIO * removed_count as f64) as usize).min(ranked.len())];
-    let point = |index: u32| TreePoint { at: positions.row(index as usize), index };
+    let point = |index: u32| TreePoint { position: positions.row(index as usize), index };
     let mut points: Vec<TreePoint> = (0..errors.len() as u32).map(point).collect();
-    points.retain(|point| point.at.iter().all(|x| x.is_finite()));
+    points.retain(|point| point.position.iter().all(|x| x.is_finite()));
     let (tree, mut nearest) = (Tree::new(&mut points), NearestPoints::default());
     let mut is_protected = vec![false; errors.len()];
     let mut is_removed = vec![false; errors.len()];
-    let mut left = removed_count;
+    let mut left_to_remove = removed_count;
     for &i in candidates {
-        if left == 0 {
+        if left_to_remove == 0 {
             break;
         }
         if is_protected[i as usize] || fixed[i as usize] {
             continue;
         }
         is_removed[i as usize] = true;
-        left -= 1;
+        left_to_remove -= 1;
         nearest.start_query(i, positions.row(i as usize), 1, f64::INFINITY);
         tree.search(&points, &mut nearest);
         if let Some(&(_, neighbor)) = nearest.sort_by_distance().first() {
@@ -44,9 +44,9 @@ pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions:
         }
     }
     for &i in &ranked {
-        if left > 0 && !is_removed[i as usize] {
+        if left_to_remove > 0 && !is_removed[i as usize] {
             is_removed[i as usize] = true;
-            left -= 1;
+            left_to_remove -= 1;
         }
     }
     (0..errors.len() as u32).filter(|&i| !is_removed[i as usize]).collect()

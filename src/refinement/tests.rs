@@ -130,7 +130,7 @@ fn interrupted_runs_resume_to_the_same_result() {
         let expected = run(&open(None)).unwrap();
         let whole = start.elapsed();
         let (place, away) = (folder.path().join(format!("work{number}")), folder.path().join("away"));
-        let asked = || Some(CacheRequest { folder: place.clone(), part: None });
+        let asked = || Some(CacheRequest { folder: place.clone(), shard: None });
         let (mut cuts, mut found) = (0, None);
         for delay in (0..40).map(|k| whole.mul_f64(0.1 * 1.15f64.powi(k))) {
             let scene = open(asked());
@@ -391,7 +391,7 @@ fn a_small_weight_of_the_outside_gives_guard_views() {
         (0..targets.views.len()).filter(|&k| targets.is_guard(k)).count()
     };
     assert_eq!(guards(&scene), 0);
-    let request = CacheRequest { folder: folder.path().join("work"), part: None };
+    let request = CacheRequest { folder: folder.path().join("work"), shard: None };
     scene.work = Cache::open(&request, String::new()).unwrap();
     let key = scene.work.key(&0);
     scene.work.store("refine", key, &1).unwrap();

@@ -101,14 +101,15 @@ struct AxisScale {
     log: bool,
     low: f64,
     high: f64,
-    from: f64,
-    to: f64,
+    start: f64,
+    end: f64,
 }
 
 impl AxisScale {
-    /// Returns a scale for the axis `axis` that covers the numbers in `values` with a margin. The axis runs from `from`
-    /// to `to`, positions in the chart in SVG units (about pixels). Returns `None` if there are no values to draw.
-    fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
+    /// Returns a scale for the axis `axis` that covers the numbers in `values` with a margin. The axis runs from
+    /// `start` to `end`, positions in the chart in SVG units (about pixels). Returns `None` if there are no values to
+    /// draw.
+    fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [start, end]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =
             values.filter(fits).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
@@ -131,15 +132,15 @@ impl AxisScale {
             log: axis.log,
             low: if flat && low == 0.0 { low } else { low - room },
             high: if flat && high == 0.0 { high } else { high + room },
-            from,
-            to,
+            start,
+            end,
         })
     }
 
     /// Extends the range of values of this axis at its upper end, so that about `room` SVG units (about pixels) stay
     /// free after the largest value.
     fn reserve_end(&mut self, room: f64) {
-        let length = self.to - self.from;
+        let length = self.end - self.start;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
     }
 
@@ -147,7 +148,7 @@ impl AxisScale {
     /// or not positive on a logarithmic axis.
     fn at(&self, value: f64) -> Option<f64> {
         let value = if self.log { value.log10() } else { value };
-        let at = self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from);
+        let at = self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start);
         at.is_finite().then_some(at)
     }
 
@@ -247,7 +248,7 @@ impl BarChart {
         let Some(x) = AxisScale::new(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
         out.x_axis(&x, &self.label, [8.0, height - BOTTOM]);
         for (row, (name, value)) in self.bars.iter().enumerate() {
-            let start = if self.is_fitted { Some(x.from) } else { x.at(0.0) };
+            let start = if self.is_fitted { Some(x.start) } else { x.at(0.0) };
             let (Some(start), Some(end)) = (start, x.at(*value)) else { continue };
             let y = 8.0 + ROW * row as f64;
             let middle = y + 0.5 * ROW + 4.0;
@@ -467,9 +468,9 @@ impl Drawing {
         let _ = write!(
             self.text,
             "<path class=\"axis\" d=\"M{:.1} {bottom:.1}H{:.1}\"/><text class=\"middle\" x=\"{:.1}\" y=\"{:.1}\">{}</text>",
-            x.from,
-            x.to,
-            0.5 * (x.from + x.to),
+            x.start,
+            x.end,
+            0.5 * (x.start + x.end),
             bottom + 39.0,
             escape(label)
         );
@@ -535,14 +536,14 @@ mod tests {
     #[test]
     fn ticks_are_round_and_inside() {
         for (low, high) in [(0.0, 1.0), (-3.0, 17.0), (48.2, 48.9), (1e-7, 3e-7), (0.0, 5e9)] {
-            let scale = AxisScale { log: false, low, high, from: 0.0, to: 100.0 };
+            let scale = AxisScale { log: false, low, high, start: 0.0, end: 100.0 };
             let ticks = scale.ticks();
             assert!((2..=12).contains(&ticks.len()), "{low} to {high}: {ticks:?}");
             assert!(ticks.iter().all(|&tick| tick >= low - 1e-9 * high && tick <= high * (1.0 + 1e-9)));
         }
-        let narrow = AxisScale { log: true, low: 62f64.log10(), high: 82f64.log10(), from: 0.0, to: 100.0 };
+        let narrow = AxisScale { log: true, low: 62f64.log10(), high: 82f64.log10(), start: 0.0, end: 100.0 };
         assert_eq!(narrow.ticks(), [65.0, 70.0, 75.0, 80.0]);
-        let log = AxisScale { log: true, low: -7.0, high: 2.0, from: 0.0, to: 100.0 };
+        let log = AxisScale { log: true, low: -7.0, high: 2.0, start: 0.0, end: 100.0 };
         assert!((3..=8).contains(&log.ticks().len()), "{:?}", log.ticks());
     }
 

@@ -25,8 +25,8 @@ pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
 /// worst one. A slider shows two images of one view with a movable border between them.
 pub(super) fn other_sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
-    let taken = [MEDIAN, WORST].map(|why| place_of(first, why));
-    let others: Vec<usize> = (0..first.len()).filter(|&place| !taken.contains(&Some(place))).collect();
+    let median_and_worst = [MEDIAN, WORST].map(|why| place_of(first, why));
+    let others: Vec<usize> = (0..first.len()).filter(|&place| !median_and_worst.contains(&Some(place))).collect();
     if others.is_empty() {
         return String::new();
     }
@@ -39,7 +39,7 @@ pub(super) fn other_sliders(results: &[Analysis], names: &[String]) -> String {
 }
 
 fn place_of(shown: &[ShownImage], why: &str) -> Option<usize> {
-    shown.iter().position(|shown| shown.choice.why.iter().any(|own| own == why))
+    shown.iter().position(|shown| shown.choice.why.iter().any(|reason| reason == why))
 }
 
 /// One of the images of a slider. A slider shows two images of one view at a time, with a movable border between them;

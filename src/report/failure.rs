@@ -189,10 +189,10 @@ pub fn sum_errors(state: &Gaussians, kinds: &[KindFlags], camera: &Camera, rende
     let shares = render_kind_shares(state, kinds, camera);
     let (original, compressed) = (brightness(&renders.original), brightness(&renders.compressed));
     let (width, height) = (camera.width as usize, camera.height as usize);
-    let mut found = ViewErrorSums { pixels: (width * height) as f64, ..ViewErrorSums::default() };
+    let mut view_sums = ViewErrorSums { pixels: (width * height) as f64, ..ViewErrorSums::default() };
     let error = squared_error(&renders.original, &renders.compressed);
     for (i, (error, shares)) in error.iter().zip(shares.data.chunks_exact(3)).enumerate() {
-        found.error += error;
+        view_sums.error += error;
         // Forward differences; 0 at the far borders.
         let step = |of: &[f64]| {
             let along = if (i + 1).is_multiple_of(width) { 0.0 } else { of[i + 1] - of[i] };
@@ -200,7 +200,7 @@ pub fn sum_errors(state: &Gaussians, kinds: &[KindFlags], camera: &Camera, rende
             [along, down]
         };
         let (o, c) = (step(&original), step(&compressed));
-        for (sums, &share) in found.kinds.iter_mut().zip(shares) {
+        for (sums, &share) in view_sums.kinds.iter_mut().zip(shares) {
             let w = f64::from(share);
             sums.weight += w;
             sums.error += w * error;
@@ -208,7 +208,7 @@ pub fn sum_errors(state: &Gaussians, kinds: &[KindFlags], camera: &Camera, rende
             sums.detail += w * (o[0] * o[0] + o[1] * o[1]);
         }
     }
-    found
+    view_sums
 }
 
 /// Returns for each pixel the squared difference of the images `a` and `b`, averaged over the channels; values are
@@ -226,31 +226,33 @@ fn brightness(image: &Image) -> Vec<f64> {
 /// Measures the errors of renders where Gaussians of the kind `kind` are visible. Returns the measurements and a
 /// [`Verdict`], which states whether these errors are visible and much larger than elsewhere.
 /// - `members`: counts and contribution of the Gaussians of this kind
-/// - `seen`: error sums of all renders
+/// - `error_sums`: error sums of all renders
 /// - `names`: frame and view of each render
 pub fn assess_failure_mode(
     kind: GaussianKind,
     members: KindTotals,
-    seen: &[ViewErrorSums],
+    error_sums: &[ViewErrorSums],
     names: &[(usize, u32)],
 ) -> FailureMode {
     let (name, happens_to) = name_and_description(kind);
-    let at = kind as usize;
-    let sum = |value: fn(&FailureSums) -> f64| seen.iter().map(|of| value(&of.kinds[at])).sum::<f64>();
+    let kind_index = kind as usize;
+    let sum = |value: fn(&FailureSums) -> f64| error_sums.iter().map(|of| value(&of.kinds[kind_index])).sum::<f64>();
     let (weight, error) = (sum(|s| s.weight), sum(|s| s.error));
-    let pixels: f64 = seen.iter().map(|of| of.pixels).sum();
-    let all_error: f64 = seen.iter().map(|of| of.error).sum();
+    let pixels: f64 = error_sums.iter().map(|of| of.pixels).sum();
+    let all_error: f64 = error_sums.iter().map(|of| of.error).sum();
     let shown = if pixels > 0.0 { weight / pixels } else { 0.0 };
     let psnr_there = db(error, weight);
     let psnr_elsewhere = db((all_error - error).max(0.0), pixels - weight);
     let detail = sum(|s| s.detail);
-    let worst = (0..seen.len())
-        .filter(|&place| seen[place].kinds[at].weight >= MIN_PIXEL_SHARE * seen[place].pixels)
-        .filter_map(|place| Some((place, db(seen[place].kinds[at].error, seen[place].kinds[at].weight)?)))
+    let worst = (0..error_sums.len())
+        .filter(|&place| error_sums[place].kinds[kind_index].weight >= MIN_PIXEL_SHARE * error_sums[place].pixels)
+        .filter_map(|place| {
+            Some((place, db(error_sums[place].kinds[kind_index].error, error_sums[place].kinds[kind_index].weight)?))
+        })
         .min_by(|a, b| a.1.total_cmp(&b.1))
         .map(|(place, psnr)| WorstPlace { place, frame: names[place].0, view: names[place].1, psnr });
     let lost = members.fates.is_some().then_some(members.shares.1);
-    let apart = psnr_there
+    let is_distinct = psnr_there
         .zip(psnr_elsewhere)
         .is_some_and(|(there, elsewhere)| there < VISIBLE_ERROR_PSNR_DB && there <= elsewhere - MIN_PSNR_GAP_DB);
     let verdict = if members.count == 0 {
@@ -259,7 +261,7 @@ pub fn assess_failure_mode(
         Verdict::Unseen
     } else if lost.is_some_and(|lost| lost < MIN_LOST_CONTRIBUTION) {
         Verdict::Untouched
-    } else if apart {
+    } else if is_distinct {
         Verdict::Flagged
     } else {
         Verdict::Passed

@@ -90,30 +90,30 @@ pub type KindFlags = [bool; 3];
 /// Fails if a frame cannot be read.
 pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Result<Vec<KindFlags>> {
     let (rows, extent) = (scored.rows()?, scored.reference.extent);
-    let mut found = vec![[false; 3]; rows.len()];
+    let mut flags = vec![[false; 3]; rows.len()];
     let frames = samples(source.info().times.len());
     if rows.is_empty() || frames.is_empty() {
-        return Ok(found);
+        return Ok(flags);
     }
     let visible = |i: usize| rows.life[i] > 0 && rows.c[i] > 0.0;
-    let all: Vec<u32> = (0..rows.len() as u32).collect();
-    let reference = gather(source, &all, scored.reference.frame, Attributes::POSITION | Attributes::LOG_SCALE)?;
-    let fast: Vec<u32> = all
+    let all_ids: Vec<u32> = (0..rows.len() as u32).collect();
+    let reference = gather(source, &all_ids, scored.reference.frame, Attributes::POSITION | Attributes::LOG_SCALE)?;
+    let fast: Vec<u32> = all_ids
         .iter()
         .copied()
         .filter(|&i| visible(i as usize) && rows.d[i as usize] >= MIN_FAST_MOTION * extent)
         .collect();
     for (&id, bent) in fast.iter().zip(non_rigid_motion(source, &reference, &fast, visible, &frames, NEAREST * extent)?)
     {
-        found[id as usize][GaussianKind::Motion as usize] = bent >= MIN_NON_RIGID_CHANGE;
+        flags[id as usize][GaussianKind::Motion as usize] = bent >= MIN_NON_RIGID_CHANGE;
     }
-    let recolored = color_change(source, &all, &frames, alpha_min)?;
+    let recolored = color_change(source, &all_ids, &frames, alpha_min)?;
     for i in (0..rows.len()).filter(|&i| visible(i)) {
-        found[i][GaussianKind::Thin as usize] = is_thin(reference.log_scale.row(i));
-        found[i][GaussianKind::Appearance as usize] = rows.d[i] <= MAX_STILL_MOTION * extent
+        flags[i][GaussianKind::Thin as usize] = is_thin(reference.log_scale.row(i));
+        flags[i][GaussianKind::Appearance as usize] = rows.d[i] <= MAX_STILL_MOTION * extent
             && (rows.v[i].sqrt() >= MIN_OPACITY_CHANGE || recolored.get(i).is_some_and(|&c| c >= MIN_COLOR_CHANGE));
     }
-    Ok(found)
+    Ok(flags)
 }
 
 /// Returns two fractions for each kind of Gaussian (fast, thin, changing in appearance), in this order:
@@ -170,7 +170,7 @@ fn non_rigid_motion(
     if ids.is_empty() {
         return Ok(Vec::new());
     }
-    let point = |i: usize| TreePoint { at: reference.position.row(i), index: i as u32 };
+    let point = |i: usize| TreePoint { position: reference.position.row(i), index: i as u32 };
     let index = PointIndex::new((0..reference.len()).filter(|&i| visible(i)).map(point).collect(), f64::INFINITY);
     let near: Vec<Vec<u32>> = ids
         .par_iter()
@@ -214,26 +214,26 @@ fn non_rigid_motion(
         .collect())
 }
 
-/// Returns how much the base color of each of the Gaussians `all` (ids) changes over time: its standard deviation, root
-/// mean square over the channels, with colors in [0, 1]. Of the frames `frames`, only those at which the Gaussian is
-/// alive (opacity at least `alpha_min`) count. Returns an empty list if colors do not vary.
-fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
+/// Returns how much the base color of each of the Gaussians with the ids `ids` changes over time: its standard
+/// deviation, root mean square over the channels, with colors in [0, 1]. Of the frames `frames`, only those at which
+/// the Gaussian is alive (opacity at least `alpha_min`) count. Returns an empty list if colors do not vary.
+fn color_change(source: &dyn FrameSource, ids: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Attributes::SH) {
         return Ok(Vec::new());
     }
     // Differences from the first color: sums of small numbers lose no digits.
-    let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
-    let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
+    let mut first: Vec<Option<[f64; 3]>> = vec![None; ids.len()];
+    let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); ids.len()];
     let columns = Attributes::SH | Attributes::OPACITY;
-    let mut reader = FrameReaders::open(source, Ids::List(all), columns, &ReadPlan::new(frames.to_vec()))?;
-    let mut now = reader.state_buffer();
+    let mut reader = FrameReaders::open(source, Ids::List(ids), columns, &ReadPlan::new(frames.to_vec()))?;
+    let mut state = reader.state_buffer();
     for &frame in frames {
-        reader.read(frame, columns, &mut now)?;
+        reader.read(frame, columns, &mut state)?;
         for (i, (n, sum, squares)) in sums.iter_mut().enumerate() {
-            if opacity(now.opacity_logit.row::<1>(i)[0]) < alpha_min {
+            if opacity(state.opacity_logit.row::<1>(i)[0]) < alpha_min {
                 continue;
             }
-            let color = now.sh.row::<3>(i).map(|c| SH_C0 * f64::from(c));
+            let color = state.sh.row::<3>(i).map(|c| SH_C0 * f64::from(c));
             let start = first[i].get_or_insert(color);
             *n += 1;
             for c in 0..3 {

@@ -73,7 +73,7 @@ pub struct ReportOptions {
     /// Original, first compressed model, and views to compare. The CSV file named in these options is not written.
     pub evaluate: EvaluateOptions,
     /// Paths of further compressed models of the same original.
-    pub more: Vec<PathBuf>,
+    pub further_compressed: Vec<PathBuf>,
     /// Path of a file `sweep.json` that the command `sweep` wrote, to include its curves.
     pub sweep: Option<PathBuf>,
     /// Path of a file `precision.json` that the command `precision` wrote, to include its plots.
@@ -102,12 +102,12 @@ pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
 /// Fails as [`report`] does.
 pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let mut inputs = options.evaluate.input_paths();
-    inputs.extend(options.more.iter().map(PathBuf::as_path));
+    inputs.extend(options.further_compressed.iter().map(PathBuf::as_path));
     inputs.extend(options.sweep.as_deref());
     inputs.extend(options.precision.as_deref());
     check_folder_name(&options.output, "report")?;
     check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
-    if !options.more.is_empty() && options.evaluate.original.is_stream() {
+    if !options.further_compressed.is_empty() && options.evaluate.original.is_stream() {
         return Err(Error::usage(
             "several results: expected an original that can be read again, found standard input (-)",
         ));
@@ -115,7 +115,7 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let trade_off = options.sweep.as_deref().map(|path| read_result(path, "sweep")).transpose()?;
     let precision = options.precision.as_deref().map(|path| read_result(path, "precision")).transpose()?;
     let mut results = vec![analyze(&options.evaluate, None, options.render_time)?];
-    for path in &options.more {
+    for path in &options.further_compressed {
         let evaluate = EvaluateOptions { compressed: path.clone(), ..options.evaluate.clone() };
         let choices: Vec<ChosenRender> = results[0].shown.iter().map(|shown| shown.choice.clone()).collect();
         results.push(analyze(&evaluate, Some(&choices), options.render_time)?);

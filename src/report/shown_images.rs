@@ -68,14 +68,14 @@ pub fn choose_renders(evaluation: &Evaluation) -> Vec<ChosenRender> {
         evaluation.loss.per_frame.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.frame);
     let of_view = lowest(&mut (0..scores.len()).filter(|&i| Some(scores[i].view) == view));
     let of_frame = lowest(&mut (0..scores.len()).filter(|&i| Some(scores[i].frame) == frame));
-    let wanted = [
+    let candidates = [
         (WORST, by_psnr.first().copied()),
         ("worst view", of_view),
         ("worst frame", of_frame),
         (MEDIAN, by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
     ];
     let mut chosen: Vec<ChosenRender> = Vec::new();
-    for (why, place) in wanted {
+    for (why, place) in candidates {
         let Some(place) = place else { continue };
         if let Some(same) = chosen.iter_mut().find(|choice| choice.place == place) {
             same.why.push(why.to_owned());

@@ -117,7 +117,9 @@ fn effort_chart(knob: &EffortCurve, trade_off: &TradeOff) -> Chart {
     let is_beside = |point: &&TradeOffPoint| {
         let without = Method::ALL.into_iter().find(|method| method.name() == point.method);
         let refined = without.and_then(Method::with_refinement).map(Method::name);
-        first.is_some_and(|first| first.asked == point.asked && refined == Some(first.method.as_str()))
+        first.is_some_and(|first| {
+            first.requested_fraction == point.requested_fraction && refined == Some(first.method.as_str())
+        })
     };
     let mut series = vec![Series {
         name: format!("{}, {} beside the marks", first.map_or("", |point| &point.method), knob.parameter),
@@ -196,7 +198,7 @@ mod tests {
         let bytes = count as u64 * 248;
         TradeOffPoint {
             method: method.to_owned(),
-            asked: None,
+            requested_fraction: None,
             count,
             bytes,
             psnr,
@@ -258,7 +260,7 @@ mod tests {
         let settings = [(100, 20.0), (1500, 40.0)].map(setting).to_vec();
         let knob = EffortCurve { parameter: "refine_steps".to_owned(), settings };
         let mut other_size = point("no-refine", 50, 30.0, None);
-        other_size.asked = Some(0.5);
+        other_size.requested_fraction = Some(0.5);
         let points = vec![point("no-refine", 10, 15.0, None), other_size, point("random", 10, 5.0, None)];
         let found = found(points, vec![knob]);
         let charts = charts(&found);

@@ -29,8 +29,8 @@ pub use compressed::open_compressed;
 pub use input::{InputOptions, OpenedInput, load_cameras};
 pub use open::{first_frame_box, from_input, open_input, open_scene, scratch_beside};
 pub use stream::{FrameQuota, frame_quota, is_linked, link_stream, open_stream, receiving_estimate};
+pub(crate) use work::add_file_stamps;
 pub use work::open_cache;
-pub(crate) use work::stamps;
 
 /// Input (a model or a sequence of frames) together with its cameras, the schedule of its views, and the memory limits,
 /// folders and cache of the run.

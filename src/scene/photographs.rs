@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use hashbrown::HashMap;
 
-use super::work::stamps;
+use super::work::add_file_stamps;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::image::{measure, read_png};
 use crate::model::{Camera, FrameView, Rig};
@@ -98,7 +98,7 @@ impl Photographs {
         let mut files = Vec::with_capacity(views.len());
         for view in views {
             if let Some(file) = self.files.get(&(view.frame, view.view)) {
-                stamps(&fs::canonicalize(file).map_err(Error::io("find", file))?, &mut files)?;
+                add_file_stamps(&fs::canonicalize(file).map_err(Error::io("find", file))?, &mut files)?;
             }
         }
         Ok(files)

@@ -98,29 +98,29 @@ fn cached_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -
 fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
-    stamps(&path, &mut files)?;
+    add_file_stamps(&path, &mut files)?;
     Ok(CacheKey::new(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
 /// Appends the path, the length in bytes, and the time of the last change (ns since 1970) of the file `path` to
 /// `files`. If `path` is a folder, appends them for all files in it and in its subfolders, in the order of their paths.
-pub(crate) fn stamps(path: &Path, files: &mut Vec<(String, u64, u128)>) -> Result<()> {
+pub(crate) fn add_file_stamps(path: &Path, files: &mut Vec<(String, u64, u128)>) -> Result<()> {
     let name = path.to_string_lossy().into_owned();
     // Broken links are not part of an input, so only their paths are recorded.
-    let Ok(found) = fs::metadata(path) else {
+    let Ok(metadata) = fs::metadata(path) else {
         files.push((name, 0, 0));
         return Ok(());
     };
-    if found.is_dir() {
+    if metadata.is_dir() {
         let failed = |error| Error::io("read the folder", path)(error);
         let mut entries = Vec::new();
         for entry in fs::read_dir(path).map_err(failed)? {
             entries.push(entry.map_err(failed)?.path());
         }
         entries.sort();
-        return entries.iter().try_for_each(|entry| stamps(entry, files));
+        return entries.iter().try_for_each(|entry| add_file_stamps(entry, files));
     }
-    let changed = found.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
-    files.push((name, found.len(), changed.map_or(0, |since| since.as_nanos())));
+    let changed = metadata.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+    files.push((name, metadata.len(), changed.map_or(0, |since| since.as_nanos())));
     Ok(())
 }

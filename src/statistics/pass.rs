@@ -76,16 +76,16 @@ pub fn scan_blocks(
 
 impl ScanResult {
     /// Converts the result of a scan that read only the frames `frames` (increasing indices) into a result for the
-    /// whole sequence, which has `all` frames.
+    /// whole sequence, which has `frame_count` frames.
     ///
     /// - Life spans grow in proportion to the number of frames.
     /// - The number of Gaussians alive (opacity ≥ alpha_min) is 0 in frames that were not read.
     /// - The trajectory magnitude D, the curvature κ and the opacity variance V become 0, because steps between the
     ///   frames that were read are not the steps of the sequence.
-    pub fn extrapolate_to_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
-        let mut alive_per_frame = vec![0; all];
+    pub fn extrapolate_to_all_frames(mut self, frames: &[usize], frame_count: usize) -> ScanResult {
+        let mut alive_per_frame = vec![0; frame_count];
         frames.iter().zip(&self.alive_per_frame).for_each(|(&frame, &alive)| alive_per_frame[frame] = alive);
-        let in_all = |life: u32| (life as usize * all).div_ceil(frames.len().max(1)) as u32;
+        let in_all = |life: u32| (life as usize * frame_count).div_ceil(frames.len().max(1)) as u32;
         self.rows.life.iter_mut().for_each(|life| *life = in_all(*life));
         for values in [&mut self.rows.d, &mut self.rows.kappa, &mut self.rows.v] {
             values.fill(0.0);

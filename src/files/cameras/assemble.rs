@@ -46,7 +46,7 @@ pub(super) struct RigBuilder {
     memory_counter: MemoryCounter,
     /// Hash table for finding an equal camera: the index in `rig.cameras` of each camera, hashed by the camera's
     /// values.
-    known: HashTable<u32>,
+    camera_indices: HashTable<u32>,
     hasher: DefaultHashBuilder,
     /// (Camera index, split) pairs for which an image without a time has been added.
     untimed: HashSet<(u32, Split)>,
@@ -66,7 +66,7 @@ impl RigBuilder {
         RigBuilder {
             rig: Rig { cameras: Vec::new(), views: Vec::new(), background: None, origin: String::new() },
             memory_counter: MemoryCounter { limit: memory, used: 0 },
-            known: HashTable::new(),
+            camera_indices: HashTable::new(),
             hasher: DefaultHashBuilder::default(),
             untimed: HashSet::new(),
             files: Vec::new(),
@@ -124,7 +124,7 @@ impl RigBuilder {
         let values = camera_bits(&listed.camera);
         let (cameras, hasher) = (&mut self.rig.cameras, &self.hasher);
         let hash = hasher.hash_one(values);
-        let found = self.known.find(hash, |&at| camera_bits(&cameras[at as usize]) == values).copied();
+        let found = self.camera_indices.find(hash, |&at| camera_bits(&cameras[at as usize]) == values).copied();
         let camera = match found {
             Some(camera) => camera,
             None => {
@@ -139,7 +139,8 @@ impl RigBuilder {
                 }
                 let camera = cameras.len() as u32;
                 cameras.push(listed.camera);
-                self.known.insert_unique(hash, camera, |&at| hasher.hash_one(camera_bits(&cameras[at as usize])));
+                self.camera_indices
+                    .insert_unique(hash, camera, |&at| hasher.hash_one(camera_bits(&cameras[at as usize])));
                 camera
             }
         };
@@ -190,20 +191,20 @@ impl RigBuilder {
         };
         for (k, (path, first)) in self.files.iter().enumerate() {
             let end = self.files.get(k + 1).map_or(rig_views.len(), |next| next.1);
-            let mut taken: HashTable<u32> = HashTable::new();
+            let mut view_indices: HashTable<u32> = HashTable::new();
             for at in *first..end {
-                let Some(own) = view_key(at) else { continue };
-                let hash = self.hasher.hash_one(own);
-                if let Some(&before) = taken.find(hash, |&other| view_key(other as usize) == Some(own)) {
-                    let (view, time) = (own.0, f64::from_bits(own.2));
+                let Some(key) = view_key(at) else { continue };
+                let hash = self.hasher.hash_one(key);
+                if let Some(&earlier) = view_indices.find(hash, |&other| view_key(other as usize) == Some(key)) {
+                    let (view, time) = (key.0, f64::from_bits(key.2));
                     return Err(Error::input(
                         path,
                         place(Some(at - first)),
                         "one image per view and time",
-                        format!("view {view} at time {time} again, as in frame {}", before as usize - first),
+                        format!("view {view} at time {time} again, as in frame {}", earlier as usize - first),
                     ));
                 }
-                taken.insert_unique(hash, at as u32, |&other| self.hasher.hash_one(view_key(other as usize)));
+                view_indices.insert_unique(hash, at as u32, |&other| self.hasher.hash_one(view_key(other as usize)));
             }
         }
         Ok(Rig { background, origin, ..self.rig })

@@ -36,7 +36,7 @@ const MAX_ELEMENTS: usize = 4;
 /// # Errors
 /// Fails if the file is not valid JSON.
 pub(super) fn outline(file: &Path) -> Result<SmallValue> {
-    read(file, &ParseAbort::default(), Keep { wanted: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
+    read(file, &ParseAbort::default(), Keep { keys: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
 }
 
 /// Reads the values of the keys `keys` from a small JSON file.
@@ -44,27 +44,31 @@ pub(super) fn outline(file: &Path) -> Result<SmallValue> {
 /// # Errors
 /// Fails if the file is not valid JSON.
 pub(super) fn read_keys(file: &Path, keys: &[&str]) -> Result<SmallValue> {
-    read(file, &ParseAbort::default(), Keep { wanted: keys, elements: MAX_ELEMENTS })
+    read(file, &ParseAbort::default(), Keep { keys, elements: MAX_ELEMENTS })
 }
 
 /// Calls `take` with the index and the content of every element of the list under `key`. If `key` is `None`, the list
-/// is the document itself. Of each element only the keys `wanted` are read.
+/// is the document itself. Of each element only the keys `image_keys` are read.
 ///
 /// # Errors
 /// Fails if `take` fails, if a key occurs twice, or if the file is not valid JSON.
 pub(super) fn each_image(
     file: &Path,
     key: Option<&str>,
-    wanted: &[&str],
+    image_keys: &[&str],
     mut take: impl FnMut(usize, &SmallValue) -> Result<()>,
 ) -> Result<()> {
     let mut next = 0;
-    each_element(file, ListSelection { keys: key.as_slice(), nested: false, wanted }, |at, element| {
-        if at.index != next {
-            let place = format!("key \"{}\"", key.unwrap_or_default());
-            return Err(Error::input(file, place, "this key once", "twice"));
-        }
-        next += 1;
-        take(at.index, &element)
-    })
+    each_element(
+        file,
+        ListSelection { keys: key.as_slice(), nested: false, element_keys: image_keys },
+        |at, element| {
+            if at.index != next {
+                let place = format!("key \"{}\"", key.unwrap_or_default());
+                return Err(Error::input(file, place, "this key once", "twice"));
+            }
+            next += 1;
+            take(at.index, &element)
+        },
+    )
 }

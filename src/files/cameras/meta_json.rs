@@ -145,8 +145,8 @@ fn add_file(builder: &mut RigBuilder, file: &Path, split: Split) -> Result<usize
         KeyedValues::<u32>::BYTES,
     ];
     let (mut used, mut next) = (0, [0; KEYS.len()]);
-    let ask = ListSelection { keys: &KEYS, nested: true, wanted: &[] };
-    each_element(file, ask, |ElementPosition { key, index, inner }, value| {
+    let selection = ListSelection { keys: &KEYS, nested: true, element_keys: &[] };
+    each_element(file, selection, |ElementPosition { key, index, inner }, value| {
         let name = KEYS[key];
         if index != next[key] {
             return Err(Error::input(file, format!("key \"{name}\""), "this key once", "twice"));

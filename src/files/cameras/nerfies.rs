@@ -76,7 +76,7 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
     let mut names = [const { Vec::new() }; 3];
     each_element(
         file,
-        ListSelection { keys: &LIST_KEYS, nested: false, wanted: &[] },
+        ListSelection { keys: &LIST_KEYS, nested: false, element_keys: &[] },
         |ElementPosition { key, index, .. }, name| {
             if index != names[key].len() {
                 return Err(Error::input(file, format!("key \"{}\"", LIST_KEYS[key]), "this key once", "twice"));

@@ -28,7 +28,7 @@ pub(super) struct HeldTiles {
     /// Maximum number of bytes of tile values that are kept in memory.
     capacity: AtomicU64,
     /// Number of bytes of tile values that may still be added until `capacity` is reached.
-    left: AtomicU64,
+    remaining_bytes: AtomicU64,
     /// Whether a tile has been refused because it did not fit into the remaining memory. While this is set, every
     /// further tile is refused at once, without looking up its size in the file.
     full: AtomicBool,
@@ -43,14 +43,20 @@ impl HeldTiles {
     pub(super) fn new(slots: usize) -> HeldTiles {
         let slots = (0..slots).map(|_| TileSlot::new()).collect();
         let locks = (0..LOCKS).map(|_| Mutex::default()).collect();
-        HeldTiles { slots, locks, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
+        HeldTiles {
+            slots,
+            locks,
+            capacity: AtomicU64::new(0),
+            remaining_bytes: AtomicU64::new(0),
+            full: AtomicBool::new(false),
+        }
     }
 
     /// Raises the maximum memory for tile values to `bytes` bytes. Has no effect if `bytes` is below the present
     /// maximum.
     pub(super) fn allow(&self, bytes: u64) {
         let before = self.capacity.fetch_max(bytes, Ordering::Relaxed);
-        self.left.fetch_add(bytes.saturating_sub(before), Ordering::Relaxed);
+        self.remaining_bytes.fetch_add(bytes.saturating_sub(before), Ordering::Relaxed);
         if bytes > before {
             self.full.store(false, Ordering::Relaxed);
         }
@@ -83,14 +89,14 @@ impl HeldTiles {
         let bytes = 4 * count as u64;
         // Relaxed ordering suffices for these counters: they guard no other memory, and the slots guard their own
         // values.
-        let take = |left: u64| left.checked_sub(bytes);
-        if self.left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take).is_err() {
+        let take = |remaining: u64| remaining.checked_sub(bytes);
+        if self.remaining_bytes.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take).is_err() {
             self.full.store(true, Ordering::Relaxed);
             return Ok(None);
         }
         let mut values = vec![0.0; count].into_boxed_slice();
         if let Err(error) = decode(&mut values) {
-            self.left.fetch_add(bytes, Ordering::Relaxed);
+            self.remaining_bytes.fetch_add(bytes, Ordering::Relaxed);
             return Err(error);
         }
         Ok(Some(slot.get_or_init(|| values)))
@@ -149,7 +155,7 @@ mod tests {
                 });
             }
         });
-        assert_eq!((decoded.into_inner(), held.left.load(Ordering::Relaxed)), (1, 992));
+        assert_eq!((decoded.into_inner(), held.remaining_bytes.load(Ordering::Relaxed)), (1, 992));
     }
 
     #[test]

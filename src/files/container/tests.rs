@@ -152,7 +152,7 @@ fn a_reader_keeps_no_more_than_allowed() {
                 let kept: usize = reader.kept.iter().map(values).sum();
                 let frames = match held {
                     1 => 0,
-                    FRAME_BLOCK if reader.whole => FRAME_BLOCK + 2,
+                    FRAME_BLOCK if reader.is_whole_tile => FRAME_BLOCK + 2,
                     _ => held,
                 };
                 let most = frames * varying * ids.len();

@@ -15,11 +15,12 @@ use crate::source::{BlockReader, Ids, ReadPlan};
 const MAX_TOUCHED_BYTES: u64 = 1 << 20;
 
 /// Run of `len` Gaussians that are adjacent both in a tile and in the reader's list of Gaussians. `gaussian_block` is
-/// the index of the tile's Gaussian block. The first Gaussian has index `from` in the tile and index `to` in the list.
+/// the index of the tile's Gaussian block. The first Gaussian has index `tile_index` in the tile and index `list_index`
+/// in the list.
 struct TileRun {
     gaussian_block: u32,
-    from: usize,
-    to: usize,
+    tile_index: usize,
+    list_index: usize,
     len: usize,
 }
 
@@ -74,7 +75,7 @@ pub(super) struct TileReader<'a> {
     len: usize,
     runs: Vec<TileRun>,
     /// Whether the reader's Gaussians are exactly those of one tile, in the order of the tile.
-    pub(super) whole: bool,
+    pub(super) is_whole_tile: bool,
     /// Numbers of the frames that will be read.
     plan: ReadPlan,
     /// Index of the last frame block for which the operating system was told which tiles of the file will be read next,
@@ -97,17 +98,17 @@ impl<'a> TileReader<'a> {
     pub(super) fn new(source: &'a Container, ids: &Ids<'_>) -> TileReader<'a> {
         let block = source.reader.layout().gaussian_block as usize;
         let mut runs: Vec<TileRun> = Vec::new();
-        for (to, id) in ids.iter().enumerate() {
-            let (tile, from) = ((id / block) as u32, id % block);
+        for (list_index, id) in ids.iter().enumerate() {
+            let (tile, tile_index) = ((id / block) as u32, id % block);
             match runs.last_mut() {
-                Some(run) if run.gaussian_block == tile && run.from + run.len == from => run.len += 1,
-                _ => runs.push(TileRun { gaussian_block: tile, from, to, len: 1 }),
+                Some(run) if run.gaussian_block == tile && run.tile_index + run.len == tile_index => run.len += 1,
+                _ => runs.push(TileRun { gaussian_block: tile, tile_index, list_index, len: 1 }),
             }
         }
         // Sort the runs by tile, so that each tile is decoded once even if the Gaussians are in any order.
         runs.sort_by_key(|run| run.gaussian_block);
-        let whole = match runs[..] {
-            [TileRun { gaussian_block, from: 0, len, .. }] => {
+        let is_whole_tile = match runs[..] {
+            [TileRun { gaussian_block, tile_index: 0, len, .. }] => {
                 let range = source.reader.layout().gaussian_range(gaussian_block);
                 len as u64 == range.end - range.start
             }
@@ -117,7 +118,7 @@ impl<'a> TileReader<'a> {
             source,
             len: ids.len(),
             runs,
-            whole,
+            is_whole_tile,
             plan: ReadPlan::all_frames(),
             announced_block: None,
             kept: source.places.iter().map(|_| KeptColumn::Nothing).collect(),
@@ -185,20 +186,20 @@ impl<'a> TileReader<'a> {
         if frames.len() == 1 {
             return Ok(false);
         }
-        if self.whole {
+        if self.is_whole_tile {
             let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
             let raw = reader.tile_info(at)?.encoding == Encoding::Raw;
-            let all = self.plan.max_kept_frames() >= block.len();
+            let keeps_whole_block = self.plan.max_kept_frames() >= block.len();
             // A decompressed tile takes the memory of all its frames, so keep one only if more than half of its frames
             // are needed.
-            if raw || all && 2 * frames.len() > block.len() {
+            if raw || keeps_whole_block && 2 * frames.len() > block.len() {
                 let mut tile = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
                     KeptColumn::Tile(_, tile) => tile,
                     _ => TileFrames::default(),
                 };
                 // Copy raw tiles from the file if less than a frame block may be kept, because releasing their pages
                 // frame by frame costs more.
-                let touched = match (raw, all) {
+                let touched = match (raw, keeps_whole_block) {
                     (true, true) => Some(&mut self.raw_in_use),
                     (true, false) => None,
                     (false, _) => Some(&mut self.decoded),
@@ -285,7 +286,7 @@ impl<'a> TileReader<'a> {
                 let plane = match held {
                     // A constant tile stores one frame, which holds for all frames.
                     Some(values) => &values[(within * width * len) % values.len()..][..width * len],
-                    None if self.whole => {
+                    None if self.is_whole_tile => {
                         reader.read_frame(tile, within, out)?;
                         continue;
                     }
@@ -293,7 +294,8 @@ impl<'a> TileReader<'a> {
                 };
                 for (from, to) in plane.chunks_exact(len).zip(out.chunks_exact_mut(self.len)) {
                     for run in runs {
-                        to[run.to..run.to + run.len].copy_from_slice(&from[run.from..run.from + run.len]);
+                        to[run.list_index..run.list_index + run.len]
+                            .copy_from_slice(&from[run.tile_index..run.tile_index + run.len]);
                     }
                 }
             }

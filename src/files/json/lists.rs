@@ -37,40 +37,40 @@ pub(crate) struct ListSelection<'a> {
     /// the lists themselves.
     pub(crate) nested: bool,
     /// Keys to keep of an element that is an object. A few other keys are also kept, for error messages.
-    pub(crate) wanted: &'a [&'a str],
+    pub(crate) element_keys: &'a [&'a str],
 }
 
-/// Reads lists in the JSON file at `path`. `ask` selects the lists. Calls `each` with the position and the value of
+/// Reads lists in the JSON file at `path`. `selection` names the lists. Calls `each` with the position and the value of
 /// every element.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
 pub(crate) fn each_element(
     path: &Path,
-    ask: ListSelection<'_>,
+    selection: ListSelection<'_>,
     each: impl FnMut(ElementPosition, SmallValue) -> Result<()>,
 ) -> Result<()> {
-    each_element_from(open_file(path)?, path, ask, each)
+    each_element_from(open_file(path)?, path, selection, each)
 }
 
-/// Reads lists in the JSON document in the open `file`. `ask` selects the lists. Calls `each` with the position and the
-/// value of every element. Error messages call the file `path`.
+/// Reads lists in the JSON document in the open `file`. `selection` names the lists. Calls `each` with the position and
+/// the value of every element. Error messages call the file `path`.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
 pub(crate) fn each_element_from(
     file: impl Read,
     path: &Path,
-    ask: ListSelection<'_>,
+    selection: ListSelection<'_>,
     mut each: impl FnMut(ElementPosition, SmallValue) -> Result<()>,
 ) -> Result<()> {
     let stopped = ParseAbort::default();
-    let mut lists = Lists { ask, each: &mut each, stopped: &stopped };
+    let mut lists = Lists { selection, each: &mut each, stopped: &stopped };
     read_from(file, path, &stopped, Document(&mut lists))
 }
 
 /// Calls `each` with the key and value of every entry of the JSON object in the file at `path`, in order. Does not call
-/// it if the document is not an object. Of each value only the keys `keys` are kept.
+/// it if the document is not an object. Of each value only the keys in `keys` are kept.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
@@ -80,13 +80,13 @@ pub(crate) fn each_entry(
     mut each: impl FnMut(&str, SmallValue) -> Result<()>,
 ) -> Result<()> {
     let stopped = ParseAbort::default();
-    read(path, &stopped, Entries { wanted: keys, each: &mut each, stopped: &stopped })
+    read(path, &stopped, Entries { keys, each: &mut each, stopped: &stopped })
 }
 
-/// State that the serde visitors of a document share while selected lists are read: the selection `ask`, the callback
-/// `each` for the elements, and `stopped`, the slot for an error of the callback.
+/// State that the serde visitors of a document share while selected lists are read: the `selection` of lists, the
+/// callback `each` for the elements, and `stopped`, the slot for an error of the callback.
 struct Lists<'a> {
-    ask: ListSelection<'a>,
+    selection: ListSelection<'a>,
     each: &'a mut dyn FnMut(ElementPosition, SmallValue) -> Result<()>,
     stopped: &'a ParseAbort,
 }
@@ -149,7 +149,7 @@ impl<'de> Visitor<'de> for Document<'_, '_> {
     ignore_scalars!();
 
     fn visit_seq<A: SeqAccess<'de>>(self, list: A) -> std::result::Result<(), A::Error> {
-        match self.0.ask.keys.is_empty() {
+        match self.0.selection.keys.is_empty() {
             true => List { lists: self.0, key: 0 }.visit_seq(list),
             false => IgnoredAny.visit_seq(list).map(drop),
         }
@@ -157,7 +157,7 @@ impl<'de> Visitor<'de> for Document<'_, '_> {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {
         while let Some(name) = map.next_key_seed(ShortKey)? {
-            match self.0.ask.keys.iter().position(|key| *key == name) {
+            match self.0.selection.keys.iter().position(|key| *key == name) {
                 Some(key) => map.next_value_seed(List { lists: self.0, key })?,
                 None => drop(map.next_value::<IgnoredAny>()?),
             }
@@ -179,12 +179,12 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     ignore_scalars!();
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<(), A::Error> {
-        let Lists { ask, stopped, .. } = *self.lists;
+        let Lists { selection, stopped, .. } = *self.lists;
         for index in 0.. {
             let at = ElementPosition { key: self.key, index, inner: None };
-            let value = match ask.nested {
+            let value = match selection.nested {
                 true => list.next_element_seed(InnerList { lists: self.lists, at })?,
-                false => list.next_element_seed(Keep { wanted: ask.wanted, elements: MAX_ELEMENTS })?,
+                false => list.next_element_seed(Keep { keys: selection.element_keys, elements: MAX_ELEMENTS })?,
             };
             let Some(value) = value else { break };
             (self.lists.each)(at, value).map_err(|error| stopped.by::<A::Error>(error))?;
@@ -249,9 +249,9 @@ impl<'de> Visitor<'de> for InnerList<'_, '_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<SmallValue, A::Error> {
-        let Lists { ask, stopped, .. } = *self.lists;
+        let Lists { selection, stopped, .. } = *self.lists;
         for inner in 0.. {
-            let keep = Keep { wanted: ask.wanted, elements: MAX_ELEMENTS };
+            let keep = Keep { keys: selection.element_keys, elements: MAX_ELEMENTS };
             let Some(value) = list.next_element_seed(keep)? else { break };
             let at = ElementPosition { inner: Some(inner), ..self.at };
             (self.lists.each)(at, value).map_err(|error| stopped.by::<A::Error>(error))?;
@@ -265,10 +265,10 @@ impl<'de> Visitor<'de> for InnerList<'_, '_> {
 }
 
 /// Serde visitor of a document that should be an object. Passes the key and the value of every entry to the callback
-/// `each`. Of a value that is an object, the keys `wanted` are kept. `stopped` is the slot for an error of the
+/// `each`. Of a value that is an object, the keys in `keys` are kept. `stopped` is the slot for an error of the
 /// callback.
 struct Entries<'a> {
-    wanted: &'a [&'a str],
+    keys: &'a [&'a str],
     each: &'a mut dyn FnMut(&str, SmallValue) -> Result<()>,
     stopped: &'a ParseAbort,
 }
@@ -284,7 +284,7 @@ impl<'de> Visitor<'de> for Entries<'_> {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {
         while let Some(key) = map.next_key_seed(ShortKey)? {
-            let value = map.next_value_seed(Keep { wanted: self.wanted, elements: MAX_ELEMENTS })?;
+            let value = map.next_value_seed(Keep { keys: self.keys, elements: MAX_ELEMENTS })?;
             (self.each)(&key, value).map_err(|error| self.stopped.by::<A::Error>(error))?;
         }
         Ok(())
@@ -304,8 +304,8 @@ mod tests {
 
     fn elements(text: &str, keys: &[&str], nested: bool) -> Vec<(usize, usize, Option<usize>, String)> {
         let mut found = Vec::new();
-        let ask = ListSelection { keys, nested, wanted: &[] };
-        each_element(file(text).path(), ask, |ElementPosition { key, index, inner }, value| {
+        let selection = ListSelection { keys, nested, element_keys: &[] };
+        each_element(file(text).path(), selection, |ElementPosition { key, index, inner }, value| {
             found.push((key, index, inner, value.describe()));
             Ok(())
         })
@@ -336,8 +336,8 @@ mod tests {
     #[test]
     fn error_of_the_callback_ends_reading() {
         let file = file("[1, 2, 3");
-        let ask = ListSelection { keys: &[], nested: false, wanted: &[] };
-        let error = each_element(file.path(), ask, |at, _| match at.index {
+        let selection = ListSelection { keys: &[], nested: false, element_keys: &[] };
+        let error = each_element(file.path(), selection, |at, _| match at.index {
             1 => Err(Error::usage("enough")),
             _ => Ok(()),
         });

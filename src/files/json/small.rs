@@ -36,12 +36,12 @@ pub(crate) enum SmallValue {
     Large(Box<str>),
 }
 
-/// Entries of a JSON object that are kept: those with wanted keys (keys that the reader asked for), and a few others
-/// for messages. `others` is the number of the latter.
+/// Entries of a JSON object that are kept: those with requested keys (keys that the reader asked for), and a few others
+/// for messages. `other_key_count` is the number of the latter.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Object {
     entries: Vec<(Box<str>, SmallValue)>,
-    others: usize,
+    other_key_count: usize,
 }
 
 impl Object {
@@ -62,7 +62,7 @@ impl Object {
 impl SmallValue {
     /// Builds a JSON object with the single entry `key`: `value`.
     pub(crate) fn from_entry(key: &str, value: SmallValue) -> SmallValue {
-        SmallValue::Object(Object { entries: vec![(key.into(), value)], others: 0 })
+        SmallValue::Object(Object { entries: vec![(key.into(), value)], other_key_count: 0 })
     }
 
     /// Returns the elements if this is a list of which every element is in memory; `None` for a list that was cut to
@@ -143,7 +143,7 @@ impl SmallValue {
 #[derive(Debug)]
 pub(crate) struct Keep<'a> {
     /// Keys that the reader asked for: their values are kept in memory in every object.
-    pub(crate) wanted: &'a [&'a str],
+    pub(crate) keys: &'a [&'a str],
     /// Maximum number of elements of each list that are kept in memory; the elements after them are only counted.
     pub(crate) elements: usize,
 }
@@ -240,14 +240,14 @@ impl<'de> Visitor<'de> for NestedValue<'_> {
     fn visit_map<A: MapAccess<'de>>(mut self, mut map: A) -> Result<SmallValue, A::Error> {
         let mut object = Object::default();
         while let Some(key) = map.next_key_seed(ShortKey)? {
-            let is_wanted = self.keep.wanted.contains(&&*key);
+            let is_requested = self.keep.keys.contains(&&*key);
             let is_known = object.get(&key).is_some();
-            if !is_wanted && !is_known {
-                if object.others == MAX_KEYS {
+            if !is_requested && !is_known {
+                if object.other_key_count == MAX_KEYS {
                     map.next_value::<IgnoredAny>()?;
                     continue;
                 }
-                object.others += 1;
+                object.other_key_count += 1;
             }
             // Give each entry of the document its own limit, so that a large entry cannot displace a wanted one.
             let value = match self.depth {
@@ -297,7 +297,7 @@ mod tests {
     use super::*;
 
     fn kept(text: &str) -> SmallValue {
-        let keep = Keep { wanted: &["frames", "w2c"], elements: MAX_ELEMENTS };
+        let keep = Keep { keys: &["frames", "w2c"], elements: MAX_ELEMENTS };
         read_from(text.as_bytes(), Path::new("a"), &ParseAbort::default(), keep).unwrap()
     }
 

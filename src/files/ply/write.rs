@@ -130,15 +130,15 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     write_inria_with(gaussians, comments, &[], path)
 }
 
-/// Writes a PLY file like [`write_inria`], with additional float properties `more` after the usual ones. Each element
-/// of `more` is the name of a property and its values, one per Gaussian.
+/// Writes a PLY file like [`write_inria`], with additional float properties `extra_properties` after the usual ones.
+/// Each element of `extra_properties` is the name of a property and its values, one per Gaussian.
 ///
 /// # Errors
 /// Fails like [`write_inria`].
 pub(crate) fn write_inria_with(
     gaussians: &Gaussians,
     comments: &[String],
-    more: &[(&str, &[f32])],
+    extra_properties: &[(&str, &[f32])],
     path: &Path,
 ) -> Result<()> {
     let width = gaussians.sh.width();
@@ -157,8 +157,8 @@ pub(crate) fn write_inria_with(
     planes.push(gaussians.opacity_logit.plane(0));
     planes.extend((0..3).map(|c| gaussians.log_scale.plane(c)));
     planes.extend((0..4).map(|c| gaussians.rotation.plane(c)));
-    planes.extend(more.iter().map(|(_, values)| *values));
-    let names = more.iter().map(|(name, _)| *name);
+    planes.extend(extra_properties.iter().map(|(_, values)| *values));
+    let names = extra_properties.iter().map(|(name, _)| *name);
     create(path, |out| {
         out.write_all(inria_header(gaussians.len(), rest, comments, names).as_bytes())?;
         for i in 0..gaussians.len() {
@@ -171,8 +171,13 @@ pub(crate) fn write_inria_with(
 }
 
 /// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`,
-/// followed by the properties `more`. `comments` become comment lines.
-fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl Iterator<Item = &'a str>) -> String {
+/// followed by the properties with the names `extra_names`. `comments` become comment lines.
+fn inria_header<'a>(
+    count: usize,
+    rest: usize,
+    comments: &[String],
+    extra_names: impl Iterator<Item = &'a str>,
+) -> String {
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
     for comment in comments {
         header += &format!("comment {}\n", comment.replace(['\n', '\r'], " "));
@@ -181,7 +186,7 @@ fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl I
     let names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(str::to_owned).into_iter();
     let names = names.chain((0..rest).map(|k| format!("f_rest_{k}")));
     let last = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
-    for name in names.chain(last.map(str::to_owned)).chain(more.map(str::to_owned)) {
+    for name in names.chain(last.map(str::to_owned)).chain(extra_names.map(str::to_owned)) {
         header += &format!("property float {name}\n");
     }
     header + "end_header\n"
@@ -204,7 +209,7 @@ pub(crate) fn extra_bytes_per_row(template: &Ply) -> usize {
 
 /// Writes a PLY file to `path` that is put together from its parts:
 ///
-/// - `header` is the header, which was read from the file `from` (for error messages).
+/// - `header` is the header, which was read from the file `header_path` (for error messages).
 /// - `cloud` holds the attributes of the Gaussians.
 /// - `extra_bytes` holds the bytes of the extra properties (those that hold no attribute, such as normals), row by row.
 /// - `lead` and `tail` are the bytes before and after the rows of the Gaussians.
@@ -212,18 +217,18 @@ pub(crate) fn extra_bytes_per_row(template: &Ply) -> usize {
 /// # Errors
 /// Fails if the header does not match the rows, or if the file cannot be written.
 pub(crate) fn write_rows(
-    from: &Path,
+    header_path: &Path,
     header: &PlyHeader,
     [lead, tail]: [&[u8]; 2],
     extra_bytes: &[u8],
     cloud: &Gaussians,
     path: &Path,
 ) -> Result<()> {
-    let mismatch = |expected: String| Error::input(from, "header of the PLY", expected, "others");
+    let mismatch = |expected: String| Error::input(header_path, "header of the PLY", expected, "others");
     let Some(vertex) = header.vertex().filter(|vertex| vertex.count == cloud.len() as u64) else {
         return Err(mismatch(format!("{} rows", cloud.len())));
     };
-    let layout = PlyLayout::from_element(from, vertex)?;
+    let layout = PlyLayout::from_element(header_path, vertex)?;
     let ranges = extra_ranges(&vertex.properties, &layout);
     let width: usize = ranges.iter().map(|range| range.len()).sum();
     if layout.planes(Attributes::SH).len() != cloud.sh.width() || width * cloud.len() != extra_bytes.len() {

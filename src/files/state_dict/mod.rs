@@ -140,10 +140,14 @@ impl StateDict {
         }
         // Limit the number of visits: a shared value is visited once for each of its names, and a pickle can give a
         // value any number of names.
-        let mut search =
-            TensorSearch { checkpoint: &checkpoint, left: 4 * nodes + 1000, name_bytes: 0, found: BTreeMap::new() };
+        let mut search = TensorSearch {
+            checkpoint: &checkpoint,
+            remaining_visits: 4 * nodes + 1000,
+            name_bytes: 0,
+            tensors: BTreeMap::new(),
+        };
         search.visit(root, &mut String::new(), 0)?;
-        let mut tensors = search.found;
+        let mut tensors = search.tensors;
         let mut prefix = String::new();
         while let Some(wrapper) = WRAPPERS.iter().find(|wrapper| all_begin_with(&tensors, wrapper)) {
             tensors = tensors.into_iter().map(|(name, tensor)| (name[wrapper.len()..].to_owned(), tensor)).collect();
@@ -157,29 +161,30 @@ impl StateDict {
 struct TensorSearch<'a> {
     checkpoint: &'a Checkpoint,
     /// Number of nodes of the object tree that may still be visited before the search fails.
-    left: usize,
+    remaining_visits: usize,
     /// Bytes of memory that the names and descriptions of the tensors found so far take, without their values.
     name_bytes: u64,
-    found: BTreeMap<String, TensorView>,
+    tensors: BTreeMap<String, TensorView>,
 }
 
 impl TensorSearch<'_> {
-    /// Searches for tensors in the object tree of a pickle, from node `id` downward, and adds them to `found`. `name`
+    /// Searches for tensors in the object tree of a pickle, from node `id` downward, and adds them to `tensors`. `name`
     /// is the name of the node: the keys that lead to it, joined by dots. `depth` is the number of these keys. Fails if
     /// the tree is too deep or too large, or if a value seems to be a tensor of an unknown kind.
     fn visit(&mut self, id: NodeId, name: &mut String, depth: u8) -> Result<()> {
         let (checkpoint, pickle) = (self.checkpoint, self.checkpoint.pickle());
-        self.left =
-            self.left.checked_sub(1).filter(|_| depth <= MAX_DEPTH && name.len() <= MAX_NAME_BYTES).ok_or_else(
-                || {
-                    let expected = format!("a tree of tensors with names of at most {MAX_NAME_BYTES} bytes");
-                    checkpoint.wrong("data.pkl", expected, "values that contain one another, or longer names")
-                },
-            )?;
+        self.remaining_visits = self
+            .remaining_visits
+            .checked_sub(1)
+            .filter(|_| depth <= MAX_DEPTH && name.len() <= MAX_NAME_BYTES)
+            .ok_or_else(|| {
+                let expected = format!("a tree of tensors with names of at most {MAX_NAME_BYTES} bytes");
+                checkpoint.wrong("data.pkl", expected, "values that contain one another, or longer names")
+            })?;
         if let Some(tensor) = checkpoint.tensor(id) {
             self.name_bytes += name.len() as u64 + TENSOR_BYTES;
             checkpoint.allow("data.pkl", "the list of its tensors", self.name_bytes)?;
-            self.found.insert(name.clone(), tensor);
+            self.tensors.insert(name.clone(), tensor);
             return Ok(());
         }
         if let Some(pairs) = pickle.pairs(id) {

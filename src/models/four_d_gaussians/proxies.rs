@@ -15,7 +15,7 @@ use crate::source::FrameSource;
 /// Maximum number of frames at which a proxy is compared with its members (the Gaussians that it replaces).
 const SAMPLED_FRAMES: usize = 16;
 
-/// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of the clusters `all`. The
+/// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`. The
 /// parameters are the merged state of the cluster at the reference frame, minus the changes (deltas) that the field
 /// makes at this frame to the leader, the most important member of the cluster. `merge` selects whether a proxy is
 /// placed at the mean of its members or at the canonical position of its leader.
@@ -30,11 +30,11 @@ const SAMPLED_FRAMES: usize = 16;
 /// Fails if frames cannot be evaluated.
 pub(super) fn compute_proxies(
     model: &ModelFolder,
-    all: &[Cluster],
+    clusters: &[Cluster],
     reference: ReferenceFrame,
     merge: &MergeParams,
 ) -> Result<Proxies> {
-    let leaders: Vec<u32> = all.iter().map(|cluster| cluster.leader).collect();
+    let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let of_leaders = model.canonical().pick(&leaders);
     let mut raw = of_leaders.clone();
     let mut notes = Vec::new();
@@ -46,10 +46,10 @@ pub(super) fn compute_proxies(
         ProxyPosition::Mean => Attributes::all(),
         ProxyPosition::Leader => Attributes::all().difference(Attributes::POSITION),
     };
-    for (clusters, first) in all.chunks(GAUSSIANS_PER_BLOCK).zip((0..).step_by(GAUSSIANS_PER_BLOCK)) {
-        let of_leaders = model.canonical().pick(&leaders[first..first + clusters.len()]);
+    for (block, first) in clusters.chunks(GAUSSIANS_PER_BLOCK).zip((0..).step_by(GAUSSIANS_PER_BLOCK)) {
+        let of_leaders = model.canonical().pick(&leaders[first..first + block.len()]);
         let deltas = model.deltas_at(&of_leaders.position, model.info().times[reference.frame])?;
-        let states = merged_states(model, reference, clusters, merge)?;
+        let states = merged_states(model, reference, block, merge)?;
         let mut of_block = of_leaders.clone();
         deltas.invert(&with_leader_lengths(&deltas, &of_leaders, states), solved, &mut of_block);
         raw.write_rows(first, &of_block);
@@ -62,7 +62,7 @@ pub(super) fn compute_proxies(
         ));
     }
     let mut placements = vec![merge.placement; leaders.len()];
-    let mut deviations = deviations(model, reference, all, &raw, &placements)?;
+    let mut deviations = deviations(model, reference, clusters, &raw, &placements)?;
     let tolerance = merge.max_drift * merge.length_unit.in_scene_units(reference.extent);
     let strayed: Vec<usize> = (0..leaders.len()).filter(|&i| deviations[i] > tolerance).collect();
     if merge.placement == ProxyPosition::Mean && !strayed.is_empty() {
@@ -74,7 +74,7 @@ pub(super) fn compute_proxies(
             "{} proxies drifted too far from their members and were placed at their leaders",
             strayed.len()
         ));
-        deviations = self::deviations(model, reference, all, &raw, &placements)?;
+        deviations = self::deviations(model, reference, clusters, &raw, &placements)?;
     }
     let deviation = deviations.into_iter().reduce(f64::max);
     Ok(Proxies { raw: Some(raw.into()), deviation, notes, ..Proxies::default() })

@@ -100,7 +100,7 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
 /// - `line_of(id)` returns the path and window of the member `id`.
 /// - `window(line, time)` returns the value of the window of `line` at `time`.
 /// - `visit` is called with the target state of each proxy, at each sampled frame at which the proxy is visible. The
-///   target state has the attributes `wanted`, and always rotation, scale and opacity.
+///   target state has the attributes `target_attributes`, and always rotation, scale and opacity.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -110,13 +110,13 @@ pub(in crate::models) fn match_proxies(
     rule: &MergeParams,
     line_of: impl Fn(u32) -> LinearPath,
     window: impl Fn(&LinearPath, f64) -> f64,
-    wanted: Attributes,
+    target_attributes: Attributes,
     mut visit: impl FnMut(ProxyAtFrame<'_>),
 ) -> Result<Vec<Matched>> {
     let times = &source.info().times;
     let sampled = times.len().min(SAMPLED_FRAMES);
     let frames: Vec<usize> = (0..sampled).map(|k| (2 * k + 1) * times.len() / (2 * sampled)).collect();
-    let wanted = wanted | Attributes::ROTATION | Attributes::LOG_SCALE | Attributes::OPACITY;
+    let target_attributes = target_attributes | Attributes::ROTATION | Attributes::LOG_SCALE | Attributes::OPACITY;
     let mut matched = Vec::with_capacity(clusters.len());
     for (chunk, first) in clusters.chunks(GAUSSIANS_PER_BLOCK).zip((0..).step_by(GAUSSIANS_PER_BLOCK)) {
         let leaders: Vec<u32> = chunk.iter().map(|cluster| cluster.leader).collect();
@@ -128,7 +128,7 @@ pub(in crate::models) fn match_proxies(
         let lines: Vec<LinearPath> = chunk.iter().map(line).collect();
         let mut sums = vec![FrameSums::default(); chunk.len()];
         for &frame in &frames {
-            let (time, state) = (times[frame], gather_all(&merged, frame, wanted)?);
+            let (time, state) = (times[frame], gather_all(&merged, frame, target_attributes)?);
             for (row, (line, sums)) in lines.iter().zip(&mut sums).enumerate() {
                 let (m, alpha) = (window(line, time), opacity(state.opacity_logit.row::<1>(row)[0]));
                 let weight = m * alpha;

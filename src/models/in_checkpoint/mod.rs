@@ -317,7 +317,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 /// Writes the compressed model `compressed` of `model` to `path` as `kind`, any kind of output except
 /// [`OutputKind::Model`]. Returns notes for the user. What is written depends on `kind`:
 /// - A player format that can store the motion of the model: the motion.
-/// - Any other format: the states of the Gaussians at every frame. At most `held` frames are kept in memory.
+/// - Any other format: the states of the Gaussians at every frame. At most `max_kept_frames` frames are kept in memory.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.
@@ -326,12 +326,12 @@ pub(super) fn write_frames<L: ProxyRule>(
     compressed: &CompressedModel,
     kind: OutputKind,
     path: &Path,
-    held: usize,
+    max_kept_frames: usize,
     events: &Events,
 ) -> Result<Vec<String>> {
     match write_windowed(model, compressed, kind, path)? {
         Some(notes) => Ok(notes),
-        None => write_sequence(&model.compressed_frames(compressed), kind, path, held, events),
+        None => write_sequence(&model.compressed_frames(compressed), kind, path, max_kept_frames, events),
     }
 }
 

@@ -336,7 +336,7 @@ impl LinkedTracks {
     /// frames. If all tracks of a block of tracks are absent from several successive blocks of frames, they are encoded
     /// only for the first of these blocks.
     pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
-        let mut held = self.first();
+        let mut previous_positions = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
         let compression = Compression::Zstd(1);
         let together = self.sizes().frame_block();
@@ -361,11 +361,18 @@ impl LinkedTracks {
                 sh_degree: degree,
                 varying: Attributes::all(),
             };
-            let block = FrameBlock { info, tracks: self, start, files: &files, rows: &rows, held: &held };
+            let block = FrameBlock {
+                info,
+                tracks: self,
+                start,
+                files: &files,
+                rows: &rows,
+                previous_positions: &previous_positions,
+            };
             writer.append_with_changes(&block, 0..of_block.len(), &times[of_block.clone()], &changes)?;
             for (frame, rows) in of_block.clone().zip(&rows) {
                 for row in rows {
-                    held[row.track as usize] = TrackPosition { frame: frame as u32, row: row.row };
+                    previous_positions[row.track as usize] = TrackPosition { frame: frame as u32, row: row.row };
                 }
             }
             was_still = changes.iter().map(|change| *change != BlockChange::New).collect();
@@ -390,7 +397,7 @@ struct FrameBlock<'a> {
     /// before this frame block. There are two cases:
     /// - The track has a Gaussian before the block: the last such Gaussian.
     /// - The track begins in the block or after it: the first Gaussian of the track.
-    held: &'a [TrackPosition],
+    previous_positions: &'a [TrackPosition],
 }
 
 impl FrameSource for FrameBlock<'_> {
@@ -415,7 +422,7 @@ impl FrameBlock<'_> {
     /// first frame of this block of frames. A track that begins in this block or after it gets its first state.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
         let mut by_frame: Vec<(TrackPosition, usize)> =
-            self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
+            self.previous_positions[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
         by_frame.sort_by_key(|(at, i)| (at.frame, *i));
         let mut part = Gaussians::zeros(0, self.info.sh_degree);
         for of_frame in by_frame.chunk_by(|(a, _), (b, _)| a.frame == b.frame) {

@@ -120,24 +120,24 @@ fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
     }
 }
 
-/// Creates the motion model of a 4D model from the values `parts` of its capture tuple, the training state in the
-/// checkpoint. `stored_terms` is the number of time-dependent SH terms that the model stores; the motion model uses at
-/// most that many. Fails if a value has the wrong type.
+/// Creates the motion model of a 4D model from the values `capture_values` of its capture tuple, the training state in
+/// the checkpoint. `stored_terms` is the number of time-dependent SH terms that the model stores; the motion model uses
+/// at most that many. Fails if a value has the wrong type.
 fn motion_model(
     checkpoint: &Checkpoint,
-    parts: &[NodeId],
+    capture_values: &[NodeId],
     config: &TrainingConfig,
     conventions: &TrainingConventions,
     stored_terms: usize,
 ) -> Result<Native> {
     let pickle = checkpoint.pickle();
     let wrong = |i: usize, name: &str, expected: &str| {
-        checkpoint.wrong(&place(i, name), expected, checkpoint.describe(parts[i]))
+        checkpoint.wrong(&place(i, name), expected, checkpoint.describe(capture_values[i]))
     };
-    let Node::Bool(has_4d_rotation) = *pickle.node(parts[16]) else {
+    let Node::Bool(has_4d_rotation) = *pickle.node(capture_values[16]) else {
         return Err(wrong(16, "rot_4d", "True or False"));
     };
-    let active = pickle.int(parts[18]).ok_or_else(|| wrong(18, "active_sh_degree_t", "a whole number"))?;
+    let active = pickle.int(capture_values[18]).ok_or_else(|| wrong(18, "active_sh_degree_t", "a whole number"))?;
     let configured = config.time_duration.as_ref().map(|(length, _)| *length);
     let given_period = conventions.time_duration.or(configured);
     Ok(Native {
@@ -151,12 +151,12 @@ fn motion_model(
 }
 
 /// Returns the values of a capture tuple (training state in the checkpoint) that only the training reads: statistics,
-/// and the tensors of the optimizer. `parts` are all values of the tuple. `is_4d` states that they belong to a 4D
-/// model, not to a static one.
-fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId> {
+/// and the tensors of the optimizer. `capture_values` are all values of the tuple. `is_4d` states that they belong to a
+/// 4D model, not to a static one.
+fn training_nodes(pickle: &Pickle, capture_values: &[NodeId], is_4d: bool) -> Vec<NodeId> {
     let (optimizer, statistics) = if is_4d { (11, 7..11) } else { (10, 7..10) };
-    let mut nodes: Vec<NodeId> = parts[statistics].to_vec();
-    let states = pickle.item(parts[optimizer], "state").and_then(|state| pickle.pairs(state));
+    let mut nodes: Vec<NodeId> = capture_values[statistics].to_vec();
+    let states = pickle.item(capture_values[optimizer], "state").and_then(|state| pickle.pairs(state));
     for (_, state) in states.into_iter().flatten() {
         nodes.extend(pickle.items(*state).into_iter().flatten().map(|(_, id)| id));
     }
@@ -180,16 +180,16 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         Some(&[capture, _]) => capture,
         _ => return Err(checkpoint.wrong("data.pkl", "(capture, iteration)", checkpoint.describe(pickle.root()))),
     };
-    let parts = pickle.elements(capture).unwrap_or_default().to_vec();
-    if ![CAPTURE_LENGTH_4D, CAPTURE_LENGTH_STATIC].contains(&parts.len()) {
+    let capture_values = pickle.elements(capture).unwrap_or_default().to_vec();
+    if ![CAPTURE_LENGTH_4D, CAPTURE_LENGTH_STATIC].contains(&capture_values.len()) {
         return Err(checkpoint
             .wrong("capture", "a tuple of 19 values, or of 12 for a static model", checkpoint.describe(capture))
             .hint("export its frames with its own renderer, as PLY files or as a frame stream, and give those"));
     }
-    let is_4d = parts.len() == CAPTURE_LENGTH_4D;
+    let is_4d = capture_values.len() == CAPTURE_LENGTH_4D;
     let root = description.root.as_deref().or(description.file.parent());
     let config = root.map_or_else(|| Ok(TrainingConfig::default()), TrainingConfig::read)?;
-    let part = |i: usize, name: &str| (parts[i], place(i, name));
+    let part = |i: usize, name: &str| (capture_values[i], place(i, name));
     let (xyz, place) = part(1, "xyz");
     let count = row_count(&checkpoint, xyz, &place)?;
     let (rest, place) = part(3, "features_rest");
@@ -200,17 +200,17 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         return Err(checkpoint.wrong(&place, expected, found.describe()));
     };
     let motion_model = match is_4d {
-        true => Some(motion_model(&checkpoint, &parts, &config, &conventions, stored_terms)?),
+        true => Some(motion_model(&checkpoint, &capture_values, &config, &conventions, stored_terms)?),
         false => None,
     };
     let mut notes = description.notes.clone();
-    if is_4d && !matches!(pickle.node(parts[17]), Node::None) {
+    if is_4d && !matches!(pickle.node(capture_values[17]), Node::None) {
         notes.push("the environment map of the model (its sky) is neither rendered nor compared".to_owned());
     }
     if let (Some((length, file)), None, true) = (&config.time_duration, conventions.time_duration, is_4d) {
         notes.push(format!("time_duration = {length} is taken from {file} beside the checkpoint"));
     }
-    let training_nodes = training_nodes(pickle, &parts, is_4d);
+    let training_nodes = training_nodes(pickle, &capture_values, is_4d);
     let terms = motion_model.as_ref().map_or(0, |motion_model| motion_model.terms);
     let own = if is_4d { TERMS + TERM_WIDTH * terms } else { 0 };
     let bands = sh_coefficient_count(degree);

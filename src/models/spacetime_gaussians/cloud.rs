@@ -22,7 +22,7 @@ pub(super) const MARKER_PROPERTY: &str = "trbf_center";
 pub(super) struct PointCloudFile {
     ply: Ply,
     /// Property of the file for each parameter in [`StoredParams::format_specific`].
-    own: Vec<Property>,
+    parameter_properties: Vec<Property>,
 }
 
 impl PointCloudFile {
@@ -58,11 +58,11 @@ impl PointCloudFile {
                 return Err(Error::input(path, "element vertex", expected, found.to_string()).hint(hint));
             }
         }
-        let own = own_property_names(is_full).into_iter().map(|name| {
+        let properties = parameter_property_names(is_full).into_iter().map(|name| {
             let found = ply.properties().iter().find(|property| property.name == name).cloned();
             found.ok_or_else(|| Error::input(path, "element vertex", format!("property {name}"), "none"))
         });
-        Ok(PointCloudFile { own: own.collect::<Result<_>>()?, ply })
+        Ok(PointCloudFile { parameter_properties: properties.collect::<Result<_>>()?, ply })
     }
 
     /// Returns notes for the user on the defects of the file. Fails if it was cut short since it was opened.
@@ -72,7 +72,7 @@ impl PointCloudFile {
 
     /// Returns whether the file belongs to the full model (with features and a decoder network), not to the lite model.
     pub(super) fn is_full(&self) -> bool {
-        self.own.len() == FULL_PARAM_COUNT
+        self.parameter_properties.len() == FULL_PARAM_COUNT
     }
 
     /// Reads the parameters of all Gaussians. `activation` turns the first three features of the full model into
@@ -83,13 +83,13 @@ impl PointCloudFile {
     pub(super) fn raw(&self, activation: ColorActivation) -> Result<StoredParams> {
         let count = self.ply.count();
         let mut raw = StoredParams { gaussians: self.ply.whole()?, format_specific: AttributeValues::zeros(0, count) };
-        let mut own = Vec::with_capacity(self.own.len() * count);
-        for property in &self.own {
-            own.extend(self.ply.values(&property.name)?.unwrap_or_default());
+        let mut values = Vec::with_capacity(self.parameter_properties.len() * count);
+        for property in &self.parameter_properties {
+            values.extend(self.ply.values(&property.name)?.unwrap_or_default());
         }
-        raw.format_specific = match own.is_empty() {
-            true => AttributeValues::zeros(self.own.len(), 0),
-            false => AttributeValues::from_planes(self.own.len(), own),
+        raw.format_specific = match values.is_empty() {
+            true => AttributeValues::zeros(self.parameter_properties.len(), 0),
+            false => AttributeValues::from_planes(self.parameter_properties.len(), values),
         };
         for column in Attributes::all().iter() {
             let names = self.ply.layout().planes(column).iter().map(|plane| match plane {
@@ -100,7 +100,7 @@ impl PointCloudFile {
                 .enumerate()
                 .try_for_each(|(c, name)| self.check(name, raw.gaussians.attribute_values(column).plane(c)))?;
         }
-        for (plane, property) in self.own.iter().enumerate() {
+        for (plane, property) in self.parameter_properties.iter().enumerate() {
             self.check(&property.name, raw.format_specific.plane(plane))?;
         }
         set_colors(&mut raw, self.is_full().then_some(activation));
@@ -177,7 +177,7 @@ impl PointCloudFile {
                     }
                 }
                 if let Some((proxy, raw)) = rows[place].proxy.zip(proxies) {
-                    for (plane, property) in self.own.iter().enumerate() {
+                    for (plane, property) in self.parameter_properties.iter().enumerate() {
                         put(bytes, property, big_endian, raw.format_specific.plane(plane)[proxy as usize]);
                     }
                 }
@@ -188,7 +188,7 @@ impl PointCloudFile {
 
 /// Returns the name of the PLY property of each parameter in [`StoredParams::format_specific`], in order: for the full
 /// model if `is_full`, else for the lite model.
-fn own_property_names(is_full: bool) -> Vec<String> {
+fn parameter_property_names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
     let mut names: Vec<String> = vec![MARKER_PROPERTY.to_owned(), "trbf_scale".to_owned()];
     names.extend(numbered("motion", OMEGA - MOTION).chain(numbered("omega", SHARED_PARAM_COUNT - OMEGA)));

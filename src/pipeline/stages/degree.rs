@@ -82,18 +82,19 @@ impl Degree {
         fits: &[ByteLimitFit],
         journal: &mut Journal,
     ) -> Result<ByteLimitFit> {
-        let all = scored.gaussian_count();
+        let gaussian_count = scored.gaussian_count();
         let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
-        journal.run_cached_stage(NAME, all, scene, key, |journal| {
-            let first = |gaussians: usize| self.refine.initial_count(gaussians, all).min(ranked.order().len());
-            let largest = fits.iter().map(|fit| first(fit.gaussians)).max().unwrap_or_default();
+        journal.run_cached_stage(NAME, gaussian_count, scene, key, |journal| {
+            let initial_count =
+                |gaussians: usize| self.refine.initial_count(gaussians, gaussian_count).min(ranked.order().len());
+            let largest = fits.iter().map(|fit| initial_count(fit.gaussians)).max().unwrap_or_default();
             let stride = self.refine.stored_stride(scene.workload().pixels, largest);
             let targets = Targets::new(scene, self.refine.target_views, stride, false)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
                 let start = CompressedModel {
                     sh_degree: fit.sh_degree,
-                    ..template.with_kept(ranked.best_ids(first(fit.gaussians)))
+                    ..template.with_kept(ranked.best_ids(initial_count(fit.gaussians)))
                 };
                 let psnr = self.refine.validation_psnr(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);

@@ -234,28 +234,33 @@ impl MergeStage {
 /// Finds how many survivors (Gaussians left by pruning) to merge, so that about `target` Gaussians are left afterwards.
 /// Merging consists of joins; each join replaces two similar Gaussians or clusters by one, so it lowers the number of
 /// Gaussians by 1.
-/// - `all`: number of all survivors.
-/// - `merged`: merges the given number of survivors with all possible joins, and returns the number of Gaussians left.
+/// - `survivor_count`: number of all survivors.
+/// - `merged_count`: merges the given number of survivors with all possible joins, and returns the number of Gaussians
+///   left.
 ///
-/// Returns a number m, from `target` to `all`, for which at most `target` Gaussians are left; it is about the largest.
-/// Such an m exists, because `target` survivors leave at most `target` Gaussians. The caller merges m survivors again
-/// and stops after m − `target` joins. Then exactly `target` Gaussians are left.
+/// Returns a number m, from `target` to `survivor_count`, for which at most `target` Gaussians are left; it is about
+/// the largest. Such an m exists, because `target` survivors leave at most `target` Gaussians. The caller merges m
+/// survivors again and stops after m − `target` joins. Then exactly `target` Gaussians are left.
 ///
 /// The search narrows the interval of possible m by the secant method. This works because more survivors leave more
 /// Gaussians after merging, except for small dips. It ends early if at most `target`/1000 Gaussians too few are left.
-fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
-    let (mut low, mut high) = (target, all);
-    let mut high_count = merged(high)?;
+fn bracket(
+    target: usize,
+    survivor_count: usize,
+    mut merged_count: impl FnMut(usize) -> Result<usize>,
+) -> Result<usize> {
+    let (mut low, mut high) = (target, survivor_count);
+    let mut high_count = merged_count(high)?;
     if high_count <= target {
         return Ok(high);
     }
-    let mut low_count = merged(low)?;
+    let mut low_count = merged_count(low)?;
     while high - low > 1 && target - low_count > target / 1000 {
         let slope = (target - low_count) as f64 / (high_count - low_count) as f64;
         // Stay away from the ends of the interval, so that a curved count cannot stall the search.
         let m = low + ((high - low) as f64 * slope.clamp(0.1, 0.9)) as usize;
         let m = m.clamp(low + 1, high - 1);
-        let count = merged(m)?;
+        let count = merged_count(m)?;
         if count <= target {
             (low, low_count) = (m, count);
         } else {
@@ -288,7 +293,7 @@ struct Trial<'a> {
     pairs_together: usize,
     /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors
     /// (Gaussians left by pruning) that is tried.
-    known: SimilarityCache,
+    similarities: SimilarityCache,
     /// Progress display of the stage: one unit per set of survivors (Gaussians left by pruning) on which merging was
     /// tried.
     progress: &'a Progress,
@@ -323,20 +328,32 @@ impl<'a> Trial<'a> {
             events: scene.events.clone(),
             gathered: None,
         };
-        let (pairs_together, known) = (scene.limits.pairs_together, SimilarityCache::default());
+        let (pairs_together, similarities) = (scene.limits.pairs_together, SimilarityCache::default());
         let importance = scored.importance()?;
         let work = &scene.work;
-        Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
+        Ok(Trial {
+            scored,
+            merge,
+            pool,
+            states,
+            classes,
+            importance,
+            meter,
+            work,
+            pairs_together,
+            similarities,
+            progress,
+        })
     }
 
     /// Merges `survivors` (increasing ids of Gaussians left by pruning) so that exactly `target` Gaussians are left,
     /// and returns the result. Fails if merging cannot reduce their number to `target`.
     fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
-        let left = merged.compressed.len();
-        if left > target {
+        let remaining = merged.compressed.len();
+        if remaining > target {
             return Err(Error::usage(format!(
-                "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  \
+                "a target of {target} Gaussians, but merging alone leaves {remaining} at the least\n  \
                  allow pruning, or looser merge passes"
             )));
         }
@@ -346,8 +363,19 @@ impl<'a> Trial<'a> {
     /// Merges `survivors` (increasing ids, all in the pool of Gaussians in memory), and returns the result. If `limit`
     /// is given, stops after this number of joins (a join reduces the number of Gaussians by one).
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<MergeOutcome> {
-        let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
-            self;
+        let Trial {
+            scored,
+            merge,
+            pool,
+            states,
+            classes,
+            importance,
+            meter,
+            work,
+            pairs_together,
+            similarities,
+            progress,
+        } = self;
         let [coverage, visibility] = &*importance;
         let survivors = Survivors {
             states,
@@ -356,17 +384,18 @@ impl<'a> Trial<'a> {
             classes,
             extent: scored.reference.extent,
         };
-        let most = *pairs_together;
-        let merged = merging::run(&survivors, merge, limit, most, |asked| {
-            let missing = known.missing(asked.pairs());
-            let found = match missing.is_empty() {
+        let max_pairs = *pairs_together;
+        let merged = merging::run(&survivors, merge, limit, max_pairs, |requested| {
+            let missing = similarities.missing(requested.pairs());
+            let measured = match missing.is_empty() {
                 true => Vec::new(),
-                false => measure(work, meter, (pool, &states.position), missing, &asked, merge)?,
+                false => measure(work, meter, (pool, &states.position), missing, &requested, merge)?,
             };
-            let found = SimilarityCache::new(found);
-            let likeness = |pair| known.similarity(pair).or_else(|| found.similarity(pair)).unwrap_or(f64::NAN);
-            let answer = asked.pairs().map(likeness).collect();
-            known.merge_from(found, most);
+            let measured = SimilarityCache::new(measured);
+            let similarity =
+                |pair| similarities.similarity(pair).or_else(|| measured.similarity(pair)).unwrap_or(f64::NAN);
+            let answer = requested.pairs().map(similarity).collect();
+            similarities.merge_from(measured, max_pairs);
             Ok::<_, Error>(answer)
         })?;
         progress.advance(1);
@@ -384,31 +413,33 @@ fn measure(
     meter: &mut PairMeter<'_>,
     (pool, reference): (&[u32], &AttributeValues),
     mut pairs: Vec<(u32, u32)>,
-    asked: &RequestedPairs<'_>,
+    requested: &RequestedPairs<'_>,
     merge: &recipe::MergeParams,
 ) -> Result<Vec<PairSimilarity>> {
     if !work.is_enabled() || pairs.len() < MIN_DIVIDED_PAIRS {
-        return meter.measure(pool, reference, pairs, asked.max_distance, asked.is_part);
+        return meter.measure(pool, reference, pairs, requested.max_distance, requested.is_part);
     }
     // Pairs are sorted by position, so that few shards read the same Gaussians.
     let rows: Vec<u32> = (0..pool.len() as u32).collect();
-    let order = voxel_order(&rows, |row| reference.row(row as usize), asked.max_distance);
+    let order = voxel_order(&rows, |row| reference.row(row as usize), requested.max_distance);
     let mut place = rows;
     order.iter().zip(0..).for_each(|(&row, k)| place[row as usize] = k);
     pairs.par_sort_unstable_by_key(|&(a, b)| (place[a as usize], place[b as usize]));
     let key = work.key(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
     let (fresh, meter) = (meter.without_trajectories(), RefCell::new(meter));
-    let compute = |some: Range<usize>| match some.len() == pairs.len() {
-        true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.max_distance, asked.is_part),
+    let compute = |range: Range<usize>| match range.len() == pairs.len() {
+        true => meter.borrow_mut().measure(pool, reference, pairs.clone(), requested.max_distance, requested.is_part),
         // The pairs of a shard are measured once, and share no buffers with other shards.
-        false => fresh.without_trajectories().measure(pool, reference, pairs[some].to_vec(), asked.max_distance, false),
+        false => {
+            fresh.without_trajectories().measure(pool, reference, pairs[range].to_vec(), requested.max_distance, false)
+        }
     };
     work.compute_in_shards(PAIRS, key, pairs.len(), compute, |parts| {
-        let mut all = Vec::with_capacity(pairs.len());
+        let mut similarities = Vec::with_capacity(pairs.len());
         for part in parts {
-            all.extend(part?);
+            similarities.extend(part?);
         }
-        Ok(all)
+        Ok(similarities)
     })
 }
 

@@ -51,7 +51,7 @@ struct StagedResult {
 pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Result<Vec<(StatisticRows, f32)>> {
     let blocks = scan.blocks();
     let lanes = rayon::current_num_threads().min(blocks);
-    let found = Mutex::new(StagedResult { blocks: (0..blocks).map(|_| None).collect(), error: None });
+    let results = Mutex::new(StagedResult { blocks: (0..blocks).map(|_| None).collect(), error: None });
     thread::scope(|scope| {
         let mut to_lanes = Vec::with_capacity(lanes);
         for _ in 0..lanes {
@@ -59,15 +59,15 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
             // A channel without capacity: the decoding thread waits until the other thread takes the reader, so a lane
             // has at most two readers.
             let (decoded, ready) = bounded(0);
-            let (done, free) = bounded(2);
-            let found = &found;
-            scope.spawn(move || decode(scan, &fetched, &free, &decoded));
-            scope.spawn(move || accumulate(scan, &ready, &done, found));
+            let (used_readers, free_readers) = bounded(2);
+            let results = &results;
+            scope.spawn(move || decode(scan, &fetched, &free_readers, &decoded));
+            scope.spawn(move || accumulate(scan, &ready, &used_readers, results));
             to_lanes.push(to_lane);
         }
         scope.spawn(move || fetch(scan, ahead, to_lanes));
     });
-    let StagedResult { blocks, error } = found.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let StagedResult { blocks, error } = results.into_inner().unwrap_or_else(PoisonError::into_inner);
     match error {
         Some((_, error)) => Err(error),
         None => Ok(blocks.into_iter().flatten().collect()),
@@ -96,17 +96,17 @@ fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>
 /// (a decoding thread and an accumulating thread).
 ///
 /// - `fetched`: yields the units of this lane, whose bytes are in the file cache.
-/// - `free`: yields the readers that the accumulating thread of the lane has finished with. A reader is used again if
-///   it reads the same block of Gaussians.
+/// - `free_readers`: yields the readers that the accumulating thread of the lane has finished with. A reader is used
+///   again if it reads the same block of Gaussians.
 /// - `decoded`: receives each unit with its reader, from which its frames can now be read, or with an error.
 fn decode<'a>(
     scan: &BlockScans<'a>,
     fetched: &Receiver<Unit>,
-    free: &Receiver<BlockReaderOf<'a>>,
+    free_readers: &Receiver<BlockReaderOf<'a>>,
     decoded: &Sender<(Unit, Result<BlockReaderOf<'a>>)>,
 ) {
     for unit in fetched {
-        let reader = free.try_iter().find(|&(block, _)| block == unit.block);
+        let reader = free_readers.try_iter().find(|&(block, _)| block == unit.block);
         let prepared = reader
             .map_or_else(|| scan.source.open(Ids::Range(scan.range(unit.block))), |(_, reader)| Ok(reader))
             .and_then(|mut reader| {
@@ -124,13 +124,13 @@ fn decode<'a>(
 ///
 /// - `ready`: yields the units of work (a block of Gaussians at the frames of one frame block) that the decoding thread
 ///   of the lane has decoded, each with its reader.
-/// - `done`: receives the readers, for use by the decoding thread.
-/// - `found`: receives the results of finished blocks, and errors.
+/// - `used_readers`: receives the readers, for use by the decoding thread.
+/// - `results`: receives the results of finished blocks, and errors.
 fn accumulate<'a>(
     scan: &BlockScans<'a>,
     ready: &Receiver<(Unit, Result<BlockReaderOf<'a>>)>,
-    done: &Sender<BlockReaderOf<'a>>,
-    found: &Mutex<StagedResult>,
+    used_readers: &Sender<BlockReaderOf<'a>>,
+    results: &Mutex<StagedResult>,
 ) {
     let mut running = None;
     for (unit, prepared) in ready {
@@ -139,18 +139,18 @@ fn accumulate<'a>(
             scan.add(running, unit.frames.clone(), &mut *reader)?;
             // The channel has space, as there are at most two readers. If the decoding thread has ended, nobody needs
             // the reader.
-            _ = done.send((block, reader));
+            _ = used_readers.send((block, reader));
             Ok(())
         });
-        let mut found = found.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut results = results.lock().unwrap_or_else(PoisonError::into_inner);
         if let Err(error) = added {
-            if found.error.as_ref().is_none_or(|&(block, _)| unit.block < block) {
-                found.error = Some((unit.block, error));
+            if results.error.as_ref().is_none_or(|&(block, _)| unit.block < block) {
+                results.error = Some((unit.block, error));
             }
             return;
         }
         if unit.frames.end == scan.frames() {
-            found.blocks[unit.block] = running.take().map(|state| scan.finish(state));
+            results.blocks[unit.block] = running.take().map(|state| scan.finish(state));
         }
     }
 }
