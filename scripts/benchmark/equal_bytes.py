@@ -4,7 +4,7 @@
     cargo build --release
     python3 scripts/benchmark/equal_bytes.py target/release/splatsieve DATA [--models A,B] [--kept 10%] [--splat-transform COMMAND]
 
-Methods: the archive (.gsz) of `default`; the result of pruning only (--no-refine --prune-only, exact field), compressed
+Methods: the archive (.gsz) of `default`; the same without refinement for the quantization steps; the result of pruning only (--no-refine --prune-only, exact field), compressed
 by xz of the standard library; of static models also what COMMAND, a splat-transform of PlayCanvas, makes of as many
 Gaussians (.sog and .spz, decimated by that program, without cameras). `part` is the fraction of the bytes of the files
 that a renderer opens. PSNR is the mean over test views, against renders of the original.
@@ -31,10 +31,13 @@ def size(path):
 
 
 def ours(program, model, kept, folder):
-    """Yields the method, the path to compare, and the bytes of the archive and of pruning only."""
+    """Yields the method, the path to compare, and the bytes of archives and of pruning only."""
     archive, pruned = folder / "small.gsz", folder / f"pruned{model.suffix}"
     compress(program, model, archive, "--ratio", kept)
     yield "archive", archive, size(archive)
+    quantized = folder / "quantized.gsz"
+    compress(program, model, quantized, "--ratio", kept, "--set", "refine_archive_steps=0")
+    yield "archive, only quantized", quantized, size(quantized)
     compress(program, model, pruned, "--ratio", kept, "--no-refine", "--prune-only", "--set", "field=exact")
     yield "pruned only, xz", pruned, sum(len(lzma.compress(file.read_bytes(), preset=6)) for file in files(pruned))
 

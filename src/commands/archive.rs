@@ -114,13 +114,13 @@ pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) ->
     check_target(output, TargetKind::File, &[&input.path], overwrite)?;
     let mut scene = open_scene(input)?;
     scene.input.check_output(OutputKind::Archive, output)?;
-    let stage = ArchiveStage { psnr: None };
+    let stage = ArchiveStage { psnr: None, refine: None };
     scene.plan_memory(input.memory, |work, limits| vec![stage.resource_estimate(work, limits)])?;
     let info = scene.source().info();
     let (gaussians, frames) = (info.count, info.times.len());
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut journal = Journal { whole: scene.full_read()?, notes: scene.notes.clone(), ..Journal::default() };
-    let (archived, summary) = stage.archive(&scene, &all, ArchiveTarget::Nothing, &mut journal)?;
+    let (archived, summary) = stage.archive(&scene, &all, ArchiveTarget::Nothing, &[], &mut journal)?;
     let staged = StagedFile::new(output, overwrite)?;
     match archived {
         PreparedArchive::Content(encoded) => {

@@ -51,6 +51,7 @@ mod tests {
                 psnr: odd,
                 level: odd,
                 loss: odd,
+                is_refined: true,
                 parts: None,
                 bounds: Some(BTreeMap::from([("position".to_owned(), odd)])),
                 bits: BTreeMap::new(),

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use super::ids::parse_ids;
-use super::planning::{InputMeta, MemoryFallback, Planning};
+use super::planning::{InputMeta, MemoryFallback, OptionalWork, Planning};
 use super::request::{Goal, PruneOrMerge, Quality, Request, decibels};
 use super::search::SearchStage;
 use super::stage::{CountPlan, EstimateInput, MeasuredOnArrival, Phase, Stage, StageList};
@@ -47,7 +47,7 @@ impl RunPlan {
     /// Fails if a parameter of the recipe is out of range, if the input has fewer Gaussians than the target, if an id
     /// that the request names does not exist in the input, or if options exclude each other.
     pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
-        RunPlan::with_fallback(request, input, MemoryFallback::Nothing, true)
+        RunPlan::with_fallback(request, input, MemoryFallback::Nothing, OptionalWork::ALL)
     }
 
     /// Returns the plan of a run that only runs `measure`, the stages that compute the statistics and scores of the
@@ -65,8 +65,8 @@ impl RunPlan {
     /// - nothing is refined.
     ///
     /// If none of them fits, returns the plan with full refinement. It is refused later with an error that names the
-    /// smallest sufficient limit. The plan includes the measurement of the quality of the result if there is memory for
-    /// it.
+    /// smallest sufficient limit. The plan includes the measurement of the quality of the result, and the refinement of
+    /// the values of an archive for their quantization steps, if there is memory for them.
     ///
     /// # Errors
     /// Fails in the cases in which [`RunPlan::new`] fails.
@@ -75,12 +75,18 @@ impl RunPlan {
             MemoryPlan::fits_budget(*work, request.input.memory, |work, limits| plan.estimates(work, limits))
         };
         let plan = RunPlan::refining_within_memory(request, input, work, fits)?;
-        let with_quality = RunPlan::with_fallback(request, input, plan.fallback, true)?;
-        Ok(if fits(&with_quality) { with_quality } else { plan })
+        for archive_refinement in [true, false] {
+            let more = OptionalWork { archive_refinement, ..OptionalWork::ALL };
+            let with_more = RunPlan::with_fallback(request, input, plan.fallback, more)?;
+            if fits(&with_more) {
+                return Ok(with_more);
+            }
+        }
+        Ok(plan)
     }
 
     /// Returns the plan of a run that stays within the memory limit, with as much refinement as fits (see
-    /// [`RunPlan::within_memory`]). The plan does not measure the quality of the result. `fits` returns whether a plan
+    /// [`RunPlan::within_memory`]). The plan has no [`OptionalWork`]. `fits` returns whether a plan
     /// stays within the memory limit.
     fn refining_within_memory(
         request: &Request,
@@ -88,7 +94,7 @@ impl RunPlan {
         work: &Workload,
         fits: impl Fn(&RunPlan) -> bool,
     ) -> Result<RunPlan> {
-        let with = |fallback| RunPlan::with_fallback(request, input, fallback, false);
+        let with = |fallback| RunPlan::with_fallback(request, input, fallback, OptionalWork::NONE);
         let least =
             |plan: &RunPlan| MemoryPlan::closest(*work, 1, |work, limits| plan.estimates(work, limits)).peak_bytes();
         let full_plan = with(MemoryFallback::Nothing)?;
@@ -127,7 +133,7 @@ impl RunPlan {
         request: &Request,
         input: InputMeta,
         fallback: MemoryFallback,
-        measures_quality: bool,
+        optional: OptionalWork,
     ) -> Result<RunPlan> {
         let Request { recipe, only, .. } = request;
         let target = request.target.map(|target| target.resolve_count(input.gaussians)).transpose()?;
@@ -148,7 +154,8 @@ impl RunPlan {
             prunes,
             merges: false,
             refine: None,
-            measures_quality,
+            measures_quality: optional.quality,
+            refines_archive: optional.archive_refinement,
             fallback,
         };
         let refine = RefineStage::from_recipe(recipe, planning.target_fraction(), planning.prunes_by_views());

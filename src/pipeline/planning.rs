@@ -53,6 +53,8 @@ pub struct Planning<'a> {
     pub refine: Option<RefineStage>,
     /// Whether the quality of the result is measured before it is written.
     pub measures_quality: bool,
+    /// Whether there is memory to refine the values of an archive for their quantization steps.
+    pub refines_archive: bool,
     /// Parts of refinement that are omitted to stay within the memory limit (`--memory`).
     pub(super) fallback: MemoryFallback,
 }
@@ -75,6 +77,22 @@ impl Planning<'_> {
     pub fn prunes_by_views(&self) -> bool {
         self.renders_views && self.prunes
     }
+}
+
+/// Optional work that a run does if there is memory for it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct OptionalWork {
+    /// Measurement of the quality of the result.
+    pub(super) quality: bool,
+    /// Refinement of the values of an archive for their quantization steps.
+    pub(super) archive_refinement: bool,
+}
+
+impl OptionalWork {
+    /// All optional work.
+    pub(super) const ALL: OptionalWork = OptionalWork { quality: true, archive_refinement: true };
+    /// No optional work.
+    pub(super) const NONE: OptionalWork = OptionalWork { quality: false, archive_refinement: false };
 }
 
 /// Parts of refinement that are omitted because they do not fit within the memory limit (`--memory`).

@@ -57,6 +57,9 @@ pub struct ArchiveSummary {
     pub level: f64,
     /// Amount by which quantization lowers the PSNR against the original, dB.
     pub loss: f64,
+    /// Whether the parameters were refined for their quantization steps. `psnr` then also shows this change.
+    #[serde(default)]
+    pub is_refined: bool,
     /// Number of bytes of each part of the archive: Gaussians, deformation field, everything else. `None` for an
     /// archive of frames, which has one part.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -126,9 +126,10 @@ impl Summary {
         }
         if let Some(archive) = &self.archive {
             write!(out, "{:<14}  {:.2} dB PSNR vs. the result before quantization", "Archive", archive.psnr)?;
-            match archive.level < PSNR_CAP_DB {
-                true => writeln!(out, "; quantization costs {:.2} dB", archive.loss)?,
-                false => writeln!(out)?,
+            match (archive.is_refined, archive.level < PSNR_CAP_DB) {
+                (true, _) => writeln!(out, "; quantization and refinement for it cost {:.2} dB", archive.loss)?,
+                (false, true) => writeln!(out, "; quantization costs {:.2} dB", archive.loss)?,
+                (false, false) => writeln!(out)?,
             }
         }
         Ok(())

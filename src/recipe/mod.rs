@@ -108,13 +108,16 @@ impl Recipe {
     }
 
     /// Returns this recipe with `steps` final optimization steps. The number of optimization steps before each prune
-    /// step (removal of the lowest-ranked Gaussians) is multiplied by the same factor and rounded up.
+    /// step (removal of the lowest-ranked Gaussians), and of those for an archive, are multiplied by the same factor and
+    /// rounded up.
     pub fn with_refinement_steps(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;
-        let per_prune = (u64::from(refine.refine_steps_per_prune) * u64::from(steps))
-            .div_ceil(u64::from(refine.refine_steps.max(1)));
-        refine.refine_steps_per_prune = per_prune.try_into().unwrap_or(u32::MAX);
+        let previous = u64::from(refine.refine_steps.max(1));
+        for other_steps in [&mut refine.refine_steps_per_prune, &mut refine.refine_archive_steps] {
+            let scaled = (u64::from(*other_steps) * u64::from(steps)).div_ceil(previous);
+            *other_steps = scaled.try_into().unwrap_or(u32::MAX);
+        }
         refine.refine_steps = steps;
         recipe
     }
@@ -135,6 +138,7 @@ impl Recipe {
         let MergeParams { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } =
             self.merge;
         let RefineParams { refine_steps, refine_steps_per_prune: steps_per_prune, refine_keyframes, .. } = self.refine;
+        let archive_steps = self.refine.refine_archive_steps;
         let mut checks = vec![
             ("scan.alpha_min", self.scan.alpha_min, in_unit(self.scan.alpha_min), "0 to 1"),
             ("scan.outside", self.scan.outside, in_unit(self.scan.outside), "0 to 1"),
@@ -176,6 +180,7 @@ impl Recipe {
                 "16 to 1000000",
             ),
             ("refine.refine_keyframes", refine_keyframes as f64, refine_keyframes <= 1000, "0 to 1000"),
+            ("refine.refine_archive_steps", archive_steps.into(), archive_steps <= MAX_STEPS, "0 to 1000000"),
             ("refine.refine_ssim", self.refine.refine_ssim, in_unit(self.refine.refine_ssim), "0 to 1"),
             ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),
             ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),

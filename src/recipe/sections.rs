@@ -177,6 +177,7 @@ pub struct RefineParams {
     pub refine_target_views: usize,
     pub refine_ssim: f64,
     pub refine_keyframes: usize,
+    pub refine_archive_steps: u32,
 }
 
 /// Parameters of the precision with which the deformation field is written.

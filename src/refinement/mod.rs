@@ -21,6 +21,7 @@ pub mod optimizer;
 pub(crate) mod optimizer_state;
 pub(crate) mod photographs;
 pub(crate) mod prune_steps;
+mod quantized;
 mod run;
 mod survivors;
 pub(crate) mod targets;
@@ -95,6 +96,8 @@ pub struct RefineStage {
     /// that refinement adds to each frame, interpolated between keyframes. With 0 keyframes, all added values are
     /// constant in time.
     pub keyframes: usize,
+    /// Number of optimization steps that adapt the parameters to the quantization of an archive.
+    pub archive_steps: usize,
     /// Fraction of the Gaussians that the user wants to keep; `None` if not given.
     pub target: Option<f64>,
 }
@@ -113,6 +116,7 @@ impl RefineStage {
             refine_target_views,
             refine_ssim,
             refine_keyframes,
+            refine_archive_steps,
         } = recipe.refine;
         let refine = RefineStage {
             columns: refine.0,
@@ -124,6 +128,7 @@ impl RefineStage {
             prunes,
             contrast_floor: recipe.select.contrast_floor,
             keyframes: refine_keyframes,
+            archive_steps: refine_archive_steps as usize,
             target,
         };
         (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
@@ -265,7 +270,8 @@ impl RefineStage {
         let keyframe_steps = (keyframe_count > 0)
             .then(|| phase(wanted, Some(("trajectory delta", keyframe_count as u64 * keyframe_bytes))));
         let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
-        let stages = [Some(original), Some(phase(wanted.max(MIN_START_COUNT_FRACTION), None)), keyframe_steps];
+        let first = wanted.max(self.min_start_count_fraction().unwrap_or(0.0));
+        let stages = [Some(original), Some(phase(first, None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
         let (target_views, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);

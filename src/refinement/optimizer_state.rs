@@ -8,7 +8,9 @@ use serde::Serialize;
 
 use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
 use super::loss::{Loss, RenderQuality};
+use super::quantized::Rounding;
 use super::targets::Targets;
+use crate::archive::CloudSteps;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, Jacobian, SequenceInfo, StoredParams};
@@ -82,6 +84,8 @@ pub(super) struct OptimizerState<'a> {
     /// One optimizer per keyframe of the time-varying delta (values that refinement adds to each frame); empty if the
     /// delta is constant in time.
     keyframe_optimizers: Vec<Adam>,
+    /// Rounding of the parameters before every render; `None` if they are rendered as they are.
+    rounding: Option<Rounding>,
     /// For each Gaussian, the attributes that vary between frames; no attributes if the model has a deformation field.
     changing: Vec<Attributes>,
     gradients: Gradients,
@@ -143,6 +147,7 @@ impl<'a> OptimizerState<'a> {
             baked_delta: ParamDelta::default(),
             constant_optimizer: Adam::new(&empty, columns, sh_degree, &[]),
             keyframe_optimizers: Vec::new(),
+            rounding: None,
             changing: vec![Attributes::empty(); fixed.len()],
             gradients: Gradients::new(0, columns, sh_degree),
             now: LinearizedState::none(state_degree),
@@ -209,6 +214,14 @@ impl<'a> OptimizerState<'a> {
         };
         self.keyframe_optimizers = (0..keyframe_count).map(|_| Adam::new(state, columns, 0, &self.fixed)).collect();
         true
+    }
+
+    /// From now on, rounds the parameters to grids with the quantization steps `steps` before every render. `start`: the
+    /// stored parameters before the first optimization step.
+    pub(super) fn set_rounding(&mut self, start: Gaussians, steps: CloudSteps) {
+        let first = self.linearized.first().map(|first| &first.state);
+        let state = self.deformation.map(|_| &self.stored.gaussians).or(first);
+        self.rounding = state.map(|state| Rounding::new(start, steps, state));
     }
 
     /// Returns the time-varying delta, the values that refinement adds to each frame: one set of values per keyframe.
@@ -375,6 +388,8 @@ impl<'a> OptimizerState<'a> {
     fn compute_state(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
         let change = self.constant_optimizer.delta();
+        let rounded = self.rounding.as_ref().map(|rounding| rounding.rounded_delta(&self.baked_delta, change));
+        let change = rounded.as_ref().unwrap_or(change);
         match &now.present {
             None => now.jacobian.add_to(&change.0, &mut now.state),
             Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),

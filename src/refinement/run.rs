@@ -40,9 +40,9 @@ const RATE_REDUCTION: f32 = 0.3;
 const LAST_RATES: [f32; 2] = [1.0, 0.5];
 /// Fraction of the final steps, taken from their end, over which the parameters are averaged. The parameters after
 /// single steps scatter around the optimum; their mean is closer to it.
-const AVERAGED_FRACTION: f64 = 0.4;
+pub(super) const AVERAGED_FRACTION: f64 = 0.4;
 /// Number of optimization steps between two parameter deltas that are averaged.
-const AVERAGE_EVERY: usize = 4;
+pub(super) const AVERAGE_EVERY: usize = 4;
 
 impl RefineStage {
     /// Prunes the model `compressed` in prune steps to `target_count` Gaussians and refines it. Returns the model with
@@ -107,7 +107,7 @@ impl RefineStage {
 }
 
 /// Random order in which training views are used. Each epoch takes all of them once, in a new order.
-struct EpochSampler {
+pub(super) struct EpochSampler {
     views: Vec<usize>,
     at: usize,
     random: SplitMix64,
@@ -116,11 +116,11 @@ struct EpochSampler {
 }
 
 impl EpochSampler {
-    fn new(views: Vec<usize>) -> EpochSampler {
+    pub(super) fn new(views: Vec<usize>) -> EpochSampler {
         EpochSampler { at: views.len(), views, random: SplitMix64(1), taken: 0 }
     }
 
-    fn next(&mut self) -> usize {
+    pub(super) fn next(&mut self) -> usize {
         if self.at == self.views.len() {
             self.random.shuffle(&mut self.views);
             self.at = 0;
@@ -204,15 +204,15 @@ struct BestState<Delta, Trajectory> {
 /// Mean of parameter deltas (values that refinement adds to the parameters). One delta is taken after every
 /// [`AVERAGE_EVERY`]-th of the last optimization steps.
 #[derive(Clone, Default, Serialize, Deserialize)]
-struct MeanDelta<Delta> {
-    delta: Delta,
+pub(super) struct MeanDelta<Delta> {
+    pub(super) delta: Delta,
     /// Number of parameter deltas of which `delta` is the mean so far.
     count: u32,
 }
 
 impl MeanDelta<ParamDelta> {
     /// Includes the parameter delta `next` in the mean.
-    fn add(&mut self, mut next: ParamDelta) {
+    pub(super) fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;
         let part = 1.0 / self.count as f32;
         self.delta.scale(1.0 - part);

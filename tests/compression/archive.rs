@@ -304,6 +304,34 @@ fn asked_quality_includes_the_loss_of_the_archive() {
     assert!(summary["archive"]["loss"].as_f64().unwrap() > 0.0, "{}", summary["archive"]);
 }
 
+/// An archive that only quantizes the same refined result has a lower PSNR on test views and at least as many bytes.
+#[test]
+fn refinement_for_quantization_gives_more_quality_in_fewer_bytes() {
+    let workplace = Workplace::new();
+    let how = "{tiny} --cameras {tiny} --ratio 0.3 --set refine_steps=300 --set refine_steps_per_prune=10 --overwrite \
+               --cache cache -o small.gsz";
+    let measured = |more: &str| {
+        let summary = workplace.summary(&format!("{how} {more}"));
+        let told = workplace.done("evaluate {tiny} small.gsz --cameras {tiny} --json");
+        let psnr = serde_json::from_str::<serde_json::Value>(&told).unwrap()["psnr"].as_f64().unwrap();
+        (fs::metadata(workplace.path("small.gsz")).unwrap().len(), psnr, summary["archive"].clone())
+    };
+    let (bytes, psnr, summary) = measured("");
+    assert_eq!(summary["is_refined"], true, "{summary}");
+    assert!(summary["loss"].as_f64().unwrap() <= 0.5, "{summary}");
+    let mut tried = Vec::new();
+    for least in (20..60).step_by(2) {
+        let (plain_bytes, plain_psnr, summary) = measured(&format!("--archive-psnr {least}"));
+        assert_eq!(summary["is_refined"], false, "{summary}");
+        tried.push((plain_bytes, plain_psnr));
+        if plain_bytes >= bytes {
+            assert!(plain_psnr < psnr, "{bytes} bytes at {psnr} dB, only quantized: {tried:?}");
+            return;
+        }
+    }
+    panic!("{bytes} bytes at {psnr} dB, only quantized: {tried:?}");
+}
+
 #[test]
 fn target_size_is_filled_by_count_and_bits_together() {
     let workplace = Workplace::new();

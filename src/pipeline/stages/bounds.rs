@@ -137,8 +137,8 @@ pub(crate) fn find(
     let names = Attributes::all().iter().map(|column| column.name().to_owned());
     let bounds = names.zip(widths).collect();
     let bits = BTreeMap::new();
-    let summary =
-        ArchiveSummary { asked: required_psnr, psnr, level, loss, parts: None, bounds: Some(bounds), bits, measured };
+    let (asked, bounds) = (required_psnr, Some(bounds));
+    let summary = ArchiveSummary { asked, psnr, level, loss, is_refined: false, parts: None, bounds, bits, measured };
     Ok((ErrorBounds::new(widths), summary))
 }
 

@@ -2,6 +2,8 @@
 //! modules of their topics (`statistics`, `pruning`, `merging`, `refinement`, `archive`).
 
 pub mod archive;
+mod archive_grids;
+mod archive_refinement;
 pub(crate) mod bands;
 pub(crate) mod bounds;
 pub(crate) mod choose;
