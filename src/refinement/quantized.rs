@@ -135,8 +135,7 @@ mod tests {
         let rounded = rounding.rounded_delta(&baked, &delta);
         for column in Attributes::all().iter() {
             let values = |gaussians: &Gaussians| gaussians.attribute_values(column).planes().to_vec();
-            let [start, baked, delta, rounded] =
-                [&start, &baked.0, &delta.0, &rounded.0].map(|gaussians| values(gaussians));
+            let [start, baked, delta, rounded] = [&start, &baked.0, &delta.0, &rounded.0].map(values);
             for k in 0..start.len() {
                 let [exact, sum] =
                     [delta[k], rounded[k]].map(|delta| f64::from(start[k] + baked[k]) + f64::from(delta));

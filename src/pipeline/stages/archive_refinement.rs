@@ -27,11 +27,12 @@ const MAX_ATTEMPTS: usize = 3;
 const FINER: [f64; 2] = [0.25, 0.8];
 /// Minimum factor by which the error after refinement could grow within the target for which coarser quantization steps
 /// are tried.
-const MIN_COARSER: f64 = 1.6;
-/// Maximum of this factor that is used, because the error before and after refinement do not grow in proportion.
-const MAX_COARSER: f64 = 3.0;
-/// Factor on the error before refinement in attempts with coarser steps, so that most of them meet the target.
-const MARGIN: f64 = 0.85;
+const MIN_GROWTH: f64 = 1.6;
+/// Exponent p: attempts with coarser steps multiply the error before refinement by (the growth that the target allows
+/// for the error after refinement)^p. The error after refinement grows faster than the one before.
+const GROWTH_EXPONENT: f64 = 0.6;
+/// Maximum growth of the error after refinement that is used for the next attempt.
+const MAX_GROWTH: f64 = 4.0;
 /// Parts of a byte limit that the archives have before refinement, one for each attempt. Refined values may take a few
 /// more bytes.
 const BYTES_PARTS: [f64; 2] = [0.995, 0.98];
@@ -131,7 +132,7 @@ impl<'a> ArchiveRefinement<'a> {
                         best = Some(refined);
                     }
                     error *= match is_met {
-                        true if growth >= MIN_COARSER => MARGIN * growth.min(MAX_COARSER),
+                        true if growth >= MIN_GROWTH => growth.min(MAX_GROWTH).powf(GROWTH_EXPONENT),
                         false if !was_met => growth.clamp(FINER[0], FINER[1]),
                         _ => break,
                     };
