@@ -25,6 +25,13 @@ pub const ATTRIBUTES: [&str; 8] =
 /// [`super::step_size()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
+/// Returns the attribute of the values whose name is [`ATTRIBUTES`]`[k]`.
+pub fn attribute(k: usize) -> Attributes {
+    const IN_ORDER: [Attributes; 5] =
+        [Attributes::POSITION, Attributes::ROTATION, Attributes::LOG_SCALE, Attributes::OPACITY, Attributes::SH];
+    IN_ORDER[k.min(IN_ORDER.len() - 1)]
+}
+
 /// Number of known values from which a value is predicted:
 /// - the value of the previous Gaussian
 /// - the mean value of the previous four Gaussians

@@ -22,7 +22,6 @@ use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload, format_bytes};
 use crate::model::RobustBox;
 use crate::model::{Camera, FrameView, Rig, Split, ViewSchedule};
 use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
-use crate::models::trajectories::DEFAULT_OUTPUT;
 use crate::passes::{FramesInMemory, ViewSampler};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
@@ -135,7 +134,7 @@ fn receive_measured(
     let header = *stream.header();
     let counting = |frames| Workload::from_stream_header(&header, block, &assumed_rig, frames);
     let work = counting(0);
-    let mut stages = plan(InputMeta { gaussians: count, has_cameras, default_output_kind: DEFAULT_OUTPUT }, &work)?;
+    let mut stages = plan(InputMeta::from_stream(count, has_cameras), &work)?;
     let MeasureStages { scan, visible, .. } = &stages.measure;
     let visible = visible.as_ref().filter(|visible| visible.can_render_on_arrival());
     let held = (block + PREFETCH_FRAMES) as u64;

@@ -355,7 +355,12 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 
-    const INPUT: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, default_output_kind: OutputKind::Gseq };
+    const INPUT: InputMeta = InputMeta {
+        gaussians: 1000,
+        has_cameras: true,
+        archives_as_frames: false,
+        default_output_kind: OutputKind::Gseq,
+    };
 
     fn request(recipe: Recipe) -> Request {
         Request::new(InputOptions::default(), "out.gseq".into(), recipe)

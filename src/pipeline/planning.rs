@@ -1,6 +1,7 @@
 //! Information from which the stages of a run are planned: the request of the user, and facts about the input model.
 
 use super::request::{Goal, Request};
+use crate::models::trajectories::DEFAULT_OUTPUT;
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
 use crate::recipe::ShDegreeRule;
@@ -14,6 +15,8 @@ pub struct InputMeta {
     pub gaussians: usize,
     /// Whether the scene has cameras of its own; `false` if the program places virtual ones.
     pub has_cameras: bool,
+    /// Whether an archive of the result stores the Gaussians at every frame instead of a model.
+    pub archives_as_frames: bool,
     /// Kind of output that is written if neither the user nor the name of the output determines one.
     pub default_output_kind: OutputKind,
 }
@@ -24,8 +27,14 @@ impl InputMeta {
         InputMeta {
             gaussians: scene.source().info().count,
             has_cameras: scene.has_cameras,
+            archives_as_frames: scene.input.archives_as_frames(),
             default_output_kind: scene.input.default_output_kind(),
         }
+    }
+
+    /// Returns the facts about a stream of frames of `gaussians` Gaussians.
+    pub fn from_stream(gaussians: usize, has_cameras: bool) -> InputMeta {
+        InputMeta { gaussians, has_cameras, archives_as_frames: true, default_output_kind: DEFAULT_OUTPUT }
     }
 }
 
@@ -71,6 +80,11 @@ impl Planning<'_> {
     pub fn chooses_sh_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
         has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == ShDegreeRule::Needed
+    }
+
+    /// Returns whether the run searches for the smallest model with a requested quality.
+    pub fn searches(&self) -> bool {
+        matches!(self.request.goal, Some(Goal::Quality(_)))
     }
 
     /// Returns whether Gaussians are pruned in the order of a ranking that is measured on rendered views.

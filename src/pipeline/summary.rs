@@ -49,13 +49,14 @@ pub struct GoalSummary {
 /// Quality and contents of an archive (compact file of the result, with quantized values).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ArchiveSummary {
-    /// Requested PSNR of renders of the archive, compared with renders of the result before quantization, dB.
+    /// Requested PSNR of renders of the archive, compared with renders of the result before quantization, dB. A refined
+    /// archive need not have it: its requirement is the maximum loss or the size from which this PSNR was derived.
     pub asked: f64,
     /// PSNR of renders of the archive, compared with renders of the result before quantization, dB.
     pub psnr: f64,
     /// PSNR of renders of the result before quantization, compared with renders of the original on the same views, dB.
     pub level: f64,
-    /// Amount by which quantization lowers the PSNR against the original, dB.
+    /// Amount by which quantization, with the refinement for it, lowers the PSNR against the original, dB.
     pub loss: f64,
     /// Whether the parameters were refined for their quantization steps. `psnr` then also shows this change.
     #[serde(default)]

@@ -107,9 +107,9 @@ impl Recipe {
         recipe
     }
 
-    /// Returns this recipe with `steps` final optimization steps. The number of optimization steps before each prune
-    /// step (removal of the lowest-ranked Gaussians), and of those for an archive, are multiplied by the same factor and
-    /// rounded up.
+    /// Returns this recipe with `steps` final optimization steps. Two other numbers of optimization steps are multiplied
+    /// by the same factor and rounded up: of those before each prune step (removal of the lowest-ranked Gaussians), and
+    /// of those for an archive.
     pub fn with_refinement_steps(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;

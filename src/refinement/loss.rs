@@ -9,6 +9,10 @@ use crate::metrics::{BYTES_PER_PIXEL, SSIM_SLOPE_BYTES_PER_PIXEL, decibels, ssim
 use crate::passes::pixel_stride;
 use crate::render::Image;
 
+/// Weight of the newest step in the running mean square of derivatives (see [`limit_slope`]). The earlier mean has the
+/// rest of 1.
+const NEWEST_WEIGHT: f64 = 0.1;
+
 /// Factor of the mean square error in the loss. It is chosen so that the squared error and 1 − SSIM contribute about
 /// equally to the loss of renders with 35 dB, if both have the weight 0.5.
 const SQUARED_WEIGHT: f64 = 20.0;
@@ -112,6 +116,28 @@ fn image(render: &Image, target: &[u16]) -> Image {
     Image { data: target.iter().copied().map(wide).collect(), ..*render }
 }
 
+/// Limits the derivatives `slope` of the loss of a guard view ([`Targets::is_guard`]) with respect to its color values.
+/// If their root mean square is above the root of `mean_square`, they are scaled down to it; if there is no mean yet, to
+/// 0. Without the limit, the large errors of guard views would raise the gradient magnitudes by which Adam divides, and
+/// so shorten later steps. The derivatives of any other view stay as they are, and their mean square updates
+/// `mean_square`. Values that are not finite do not count: the renderer ignores their pixels.
+pub(super) fn limit_slope(slope: &mut Image, is_guard: bool, mean_square: &mut Option<f64>) {
+    let squares = slope.data.iter().map(|&value| f64::from(value).powi(2)).filter(|square| square.is_finite());
+    let (sum, count) = squares.fold((0.0, 0u32), |(sum, count), square| (sum + square, count + 1));
+    if count == 0 {
+        return;
+    }
+    let own = sum / f64::from(count);
+    match *mean_square {
+        mean if is_guard => {
+            let factor = (mean.unwrap_or(0.0) / own.max(f64::MIN_POSITIVE)).sqrt().min(1.0) as f32;
+            slope.data.iter_mut().for_each(|value| *value *= factor);
+        }
+        Some(mean) => *mean_square = Some(mean + NEWEST_WEIGHT * (own - mean)),
+        None => *mean_square = Some(own),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::targets::narrow;
@@ -164,5 +190,30 @@ mod tests {
         assert!(Loss { ssim: 0.5 }.is_closer(&sharp, &soft) && !Loss { ssim: 0.5 }.is_closer(&soft, &sharp));
         let unknown = close(f64::NAN, f64::NAN);
         assert!(!Loss { ssim: 0.0 }.is_closer(&unknown, &soft) && !Loss { ssim: 0.5 }.is_closer(&unknown, &soft));
+    }
+
+    #[test]
+    fn guard_views_pull_no_harder_than_other_views() {
+        let image = |value: f32| Image { width: 2, height: 1, data: vec![value, -value, 0.0, value, -value, 0.0] };
+        let limited = |value: f32, is_guard: bool, mean: &mut Option<f64>| {
+            let mut slope = image(value);
+            limit_slope(&mut slope, is_guard, mean);
+            slope.data[0]
+        };
+        let mut mean = None;
+        assert_eq!((limited(0.5, true, &mut mean), mean), (0.0, None));
+        assert_eq!(limited(0.1, false, &mut mean), 0.1);
+        assert!((mean.unwrap() - 2.0 / 3.0 * 0.01).abs() < 1e-9);
+        assert!((limited(0.5, true, &mut mean) - 0.1).abs() < 1e-6, "scaled to the mean");
+        assert_eq!(limited(0.05, true, &mut mean), 0.05, "never scaled up");
+        let before = mean.unwrap();
+        limited(0.2, false, &mut mean);
+        assert!((mean.unwrap() - (before + 0.1 * (2.0 / 3.0 * 0.04 - before))).abs() < 1e-9);
+        let before = mean;
+        let mut odd = image(f32::NAN);
+        limit_slope(&mut odd, false, &mut mean);
+        assert!(mean.unwrap() < before.unwrap(), "NaN is left out, and zeros lower the mean");
+        limit_slope(&mut Image { width: 0, height: 0, data: Vec::new() }, false, &mut mean);
+        assert!(mean.unwrap() > 0.0);
     }
 }

@@ -1,13 +1,14 @@
 //! Optimizer with the frame states that it needs: the attributes of the survivors (Gaussians left by pruning) at the
 //! frames of the target views.
 
+use std::borrow::Cow;
 use std::num::NonZeroU32;
 
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
-use super::loss::{Loss, RenderQuality};
+use super::loss::{Loss, RenderQuality, limit_slope};
 use super::quantized::Rounding;
 use super::targets::Targets;
 use crate::archive::CloudSteps;
@@ -16,7 +17,7 @@ use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::FrameStates;
 use crate::refinement::optimizer::{Adam, RateSchedule};
-use crate::render::{Image, RemovalError, Renderer};
+use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, ReadPlan};
 
@@ -30,10 +31,6 @@ pub(super) struct StepParams {
     /// Loss that optimization steps minimize.
     pub(super) loss: Loss,
 }
-
-/// Weight of the newest step in the running mean square of derivatives (see [`limit_slope`]). The earlier mean has the
-/// rest of 1.
-const NEWEST_WEIGHT: f64 = 0.1;
 
 /// Minimum number of frames per keyframe of the time-varying delta ([`TrajectoryDelta`]: values that refinement adds to
 /// each frame, interpolated between keyframes).
@@ -216,12 +213,14 @@ impl<'a> OptimizerState<'a> {
         true
     }
 
-    /// From now on, rounds the parameters to grids with the quantization steps `steps` before every render. `start`: the
-    /// stored parameters before the first optimization step.
-    pub(super) fn set_rounding(&mut self, start: Gaussians, steps: CloudSteps) {
-        let first = self.linearized.first().map(|first| &first.state);
-        let state = self.deformation.map(|_| &self.stored.gaussians).or(first);
-        self.rounding = state.map(|state| Rounding::new(start, steps, state));
+    /// Sets that parameters are rounded to quantization grids before every render. Must be called before the first
+    /// optimization step, and [`OptimizerState::pick`] must not be called afterward.
+    /// - `start`: the stored parameters.
+    /// - `quantization`: quantization steps of their attributes.
+    pub(super) fn set_rounding(&mut self, start: Gaussians, quantization: CloudSteps) {
+        let first = self.linearized.first().map(|first| (&first.state, Attributes::all().difference(self.varying)));
+        let base = self.deformation.map(|_| (&self.stored.gaussians, Attributes::all())).or(first);
+        self.rounding = base.map(|(base, constant)| Rounding::new(start, quantization, base, constant));
     }
 
     /// Returns the time-varying delta, the values that refinement adds to each frame: one set of values per keyframe.
@@ -368,7 +367,7 @@ impl<'a> OptimizerState<'a> {
         let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
         let mut now = std::mem::take(&mut self.now);
         for k in 0..self.frames.len() {
-            self.compute_state(k, &mut now)?;
+            self.compute_state(k, self.constant_optimizer.delta(), &mut now)?;
             linearized.push(&mut now.pick(places))?;
         }
         (self.linearized, self.now) = (linearized.finish()?, now);
@@ -383,13 +382,19 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
+    /// Returns the delta of `constant_optimizer` that renders show: rounded to the quantization grids, if there are any.
+    fn rendered_delta(&self) -> Cow<'_, ParamDelta> {
+        let delta = self.constant_optimizer.delta();
+        match &self.rounding {
+            Some(rounding) => Cow::Owned(rounding.rounded_delta(&self.baked_delta, delta)),
+            None => Cow::Borrowed(delta),
+        }
+    }
+
     /// Computes into `now` the current state of the frame with index `k` in `self.frames`, including all changes that
-    /// refinement has made so far.
-    fn compute_state(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
+    /// refinement has made so far. `change`: delta of `constant_optimizer`.
+    fn compute_state(&self, k: usize, change: &ParamDelta, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
-        let change = self.constant_optimizer.delta();
-        let rounded = self.rounding.as_ref().map(|rounding| rounding.rounded_delta(&self.baked_delta, change));
-        let change = rounded.as_ref().unwrap_or(change);
         match &now.present {
             None => now.jacobian.add_to(&change.0, &mut now.state),
             Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),
@@ -453,7 +458,7 @@ impl<'a> OptimizerState<'a> {
     fn differentiate(&mut self, k: usize) -> Result<()> {
         let (target, view) = (self.targets.values(k, self.stride)?, self.targets.view(k, self.stride));
         let mut now = std::mem::take(&mut self.now);
-        self.compute_state(self.frame_index(k), &mut now)?;
+        self.compute_state(self.frame_index(k), &self.rendered_delta(), &mut now)?;
         self.gradients.clear();
         let StepParams { columns, sh_degree, loss } = self.step_params;
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
@@ -479,8 +484,9 @@ impl<'a> OptimizerState<'a> {
     /// # Errors
     /// Fails if a scratch file cannot be read.
     pub(super) fn quality(&self, views: &[usize]) -> Result<RenderQuality> {
+        let delta = self.rendered_delta();
         let errors = |(renderer, now): &mut (Renderer, LinearizedState), &k: &usize| {
-            self.compute_state(self.frame_index(k), now)?;
+            self.compute_state(self.frame_index(k), &delta, now)?;
             let (view, values) = (self.targets.view(k, self.stride), self.targets.values(k, self.stride)?);
             let image = renderer.render(&now.state, view, self.scene.background);
             Ok(self.step_params.loss.errors(&image, &values))
@@ -502,7 +508,7 @@ impl<'a> OptimizerState<'a> {
         let zero = || (self.new_worker(), RemovalError::new(self.fixed.len(), contrast_floor));
         let add_view = |((mut renderer, mut now), mut errors): ((Renderer, LinearizedState), RemovalError),
                         &k: &usize| {
-            self.compute_state(self.frame_index(k), &mut now)?;
+            self.compute_state(self.frame_index(k), self.constant_optimizer.delta(), &mut now)?;
             let mut sparse = now.present.as_ref().map(|present| RemovalError::new(present.len(), contrast_floor));
             let found = sparse.as_mut().unwrap_or(&mut errors);
             let view = self.targets.view(k, self.stride);
@@ -534,57 +540,5 @@ impl<'a> OptimizerState<'a> {
     /// Creates a renderer and a frame state buffer, as each thread needs them.
     fn new_worker(&self) -> (Renderer, LinearizedState) {
         (Renderer::new(), LinearizedState::default())
-    }
-}
-
-/// Limits the derivatives `slope` of the loss of a guard view ([`Targets::is_guard`]) with respect to its color values.
-/// If their root mean square is above the root of `mean_square`, they are scaled down to it; if there is no mean yet, to
-/// 0. Without the limit, the large errors of guard views would raise the gradient magnitudes by which Adam divides, and
-/// so shorten later steps. The derivatives of any other view stay as they are, and their mean square updates
-/// `mean_square`. Values that are not finite do not count: the renderer ignores their pixels.
-fn limit_slope(slope: &mut Image, is_guard: bool, mean_square: &mut Option<f64>) {
-    let squares = slope.data.iter().map(|&value| f64::from(value).powi(2)).filter(|square| square.is_finite());
-    let (sum, count) = squares.fold((0.0, 0u32), |(sum, count), square| (sum + square, count + 1));
-    if count == 0 {
-        return;
-    }
-    let own = sum / f64::from(count);
-    match *mean_square {
-        mean if is_guard => {
-            let factor = (mean.unwrap_or(0.0) / own.max(f64::MIN_POSITIVE)).sqrt().min(1.0) as f32;
-            slope.data.iter_mut().for_each(|value| *value *= factor);
-        }
-        Some(mean) => *mean_square = Some(mean + NEWEST_WEIGHT * (own - mean)),
-        None => *mean_square = Some(own),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn guard_views_pull_no_harder_than_other_views() {
-        let image = |value: f32| Image { width: 2, height: 1, data: vec![value, -value, 0.0, value, -value, 0.0] };
-        let limited = |value: f32, is_guard: bool, mean: &mut Option<f64>| {
-            let mut slope = image(value);
-            limit_slope(&mut slope, is_guard, mean);
-            slope.data[0]
-        };
-        let mut mean = None;
-        assert_eq!((limited(0.5, true, &mut mean), mean), (0.0, None));
-        assert_eq!(limited(0.1, false, &mut mean), 0.1);
-        assert!((mean.unwrap() - 2.0 / 3.0 * 0.01).abs() < 1e-9);
-        assert!((limited(0.5, true, &mut mean) - 0.1).abs() < 1e-6, "scaled to the mean");
-        assert_eq!(limited(0.05, true, &mut mean), 0.05, "never scaled up");
-        let before = mean.unwrap();
-        limited(0.2, false, &mut mean);
-        assert!((mean.unwrap() - (before + 0.1 * (2.0 / 3.0 * 0.04 - before))).abs() < 1e-9);
-        let before = mean;
-        let mut odd = image(f32::NAN);
-        limit_slope(&mut odd, false, &mut mean);
-        assert!(mean.unwrap() < before.unwrap(), "NaN is left out, and zeros lower the mean");
-        limit_slope(&mut Image { width: 0, height: 0, data: Vec::new() }, false, &mut mean);
-        assert!(mean.unwrap() > 0.0);
     }
 }

@@ -9,7 +9,7 @@ use super::RefineStage;
 use super::optimizer::RateSchedule;
 use super::optimizer_state::OptimizerState;
 use super::run::{AVERAGE_EVERY, AVERAGED_FRACTION, EpochSampler, MeanDelta};
-use super::targets::Targets;
+use super::targets::{Targets, ViewSplit};
 use crate::archive::{self, ATTRIBUTES, CloudSteps};
 use crate::compressed_model::ParamDelta;
 use crate::error::Result;
@@ -33,22 +33,15 @@ pub(super) struct Rounding {
 }
 
 impl Rounding {
-    /// Creates a rounding of the parameters `start` to grids with the quantization steps `steps`. Rounds only
-    /// attributes that have the same values in `state`, the parameters to which the optimizer adds its delta. A format
-    /// may store other attributes in other units, in which their grids are not uniform.
-    pub(super) fn new(start: Gaussians, steps: CloudSteps, state: &Gaussians) -> Rounding {
-        let is_equal = |column: Attributes| start.attribute_values(column) == state.attribute_values(column);
-        let column = |k: usize| {
-            let in_order = [
-                Attributes::POSITION,
-                Attributes::ROTATION,
-                Attributes::LOG_SCALE,
-                Attributes::OPACITY,
-                Attributes::SH,
-            ];
-            in_order[k.min(in_order.len() - 1)]
+    /// Creates a rounding of the stored parameters `start` to grids with the quantization steps `steps`. The optimizer
+    /// adds its deltas to the parameters `base`. Only attributes that have the same values in `start` and `base` are
+    /// rounded, and only those in `constant`: a format may store the others in other units, or for each frame.
+    pub(super) fn new(start: Gaussians, steps: CloudSteps, base: &Gaussians, constant: Attributes) -> Rounding {
+        let is_rounded = |k: &usize| {
+            let attribute = archive::attribute(*k);
+            constant.contains(attribute) && start.attribute_values(attribute) == base.attribute_values(attribute)
         };
-        let attributes = (0..ATTRIBUTES.len()).filter(|&k| is_equal(column(k))).collect();
+        let attributes = (0..ATTRIBUTES.len()).filter(is_rounded).collect();
         Rounding { start, steps, attributes }
     }
 
@@ -79,13 +72,14 @@ impl RefineStage {
     ///   must be rounded already.
     /// - `start`: stored parameters of the model, not rounded. `quantization`: quantization steps of its attributes.
     /// - `fixed`: whether each Gaussian is protected, that is, not changed.
+    /// - `views`: training and validation views. The error of the validation views sets the learning rates.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
     pub(crate) fn refine_quantized(
         &self,
         scene: &Scene,
-        targets: &Targets,
+        (targets, views): (&Targets, &ViewSplit),
         result: &dyn FrameSource,
         (start, quantization): (Gaussians, CloudSteps),
         fixed: Vec<bool>,
@@ -93,10 +87,9 @@ impl RefineStage {
     ) -> Result<ParamDelta> {
         let mut optimizer = OptimizerState::new(scene, result, targets, self.step_params(), fixed)?;
         optimizer.set_rounding(start, quantization);
-        let split = targets.split();
-        let error = optimizer.quality(&split.validation)?.typical_error();
+        let error = optimizer.quality(&views.validation)?.typical_error();
         let schedule = RateSchedule::new(self.steps, RATES[1] / RATES[0], error).scaled_by(RATES[0]);
-        let (mut sampler, mut mean) = (EpochSampler::new(split.training), MeanDelta::default());
+        let (mut sampler, mut mean) = (EpochSampler::new(views.training.clone()), MeanDelta::default());
         let averaged_after = self.steps - (self.steps as f64 * AVERAGED_FRACTION) as usize;
         for step in 1..=self.steps {
             optimizer.step(sampler.next(), &schedule)?;
@@ -130,7 +123,7 @@ mod tests {
         let (start, mut state) = (ramp(5, 0.375), ramp(5, 0.375));
         state.opacity_logit.planes_mut()[0] += 1.0;
         // Steps of 1: 2^(0/8).
-        let rounding = Rounding::new(start.clone(), [0; ATTRIBUTES.len()], &state);
+        let rounding = Rounding::new(start.clone(), [0; ATTRIBUTES.len()], &state, Attributes::all());
         let (baked, delta) = (ParamDelta(ramp(5, 0.11)), ParamDelta(ramp(5, 0.07)));
         let rounded = rounding.rounded_delta(&baked, &delta);
         for column in Attributes::all().iter() {
@@ -163,7 +156,14 @@ mod tests {
         let steps = [-80, -80, -8, -8, -8, -8, -8, -8];
         let progress = scene.events.task("test", "steps", 0);
         let refined = stage
-            .refine_quantized(&scene, &targets, &*result, (start.clone(), steps), fixed.clone(), &progress)
+            .refine_quantized(
+                &scene,
+                (&targets, &targets.split()),
+                &*result,
+                (start.clone(), steps),
+                fixed.clone(),
+                &progress,
+            )
             .unwrap();
         let quality = |delta: &ParamDelta| {
             let mut optimizer =

@@ -278,7 +278,7 @@ impl Targets {
     }
 
     /// Returns the camera of target view `k`.
-    pub(super) fn camera(&self, k: usize) -> &Camera {
+    pub(crate) fn camera(&self, k: usize) -> &Camera {
         &self.cameras[self.views[k].camera as usize]
     }
 

@@ -106,6 +106,20 @@ fn archive_bytes_ignore_thread_count() {
 }
 
 #[test]
+fn bytes_of_a_refined_archive_ignore_threads_memory_and_cache() {
+    let how = "{tiny} --cameras {tiny} --ratio 0.5 --set refine_steps=40 --set refine_steps_per_prune=10 \
+               --set refine_archive_steps=40 -o small.gsz";
+    let archive = |before: &str, after: &str| {
+        let workplace = Workplace::new();
+        workplace.done(&format!("{before} compress {how} {after}"));
+        fs::read(workplace.path("small.gsz")).unwrap()
+    };
+    let expected = archive("--threads 1", "");
+    assert!(archive("--threads 3", "") == expected, "threads change it");
+    assert!(archive("--threads 2", "--memory 256MiB --cache cache") == expected, "memory or cache change it");
+}
+
+#[test]
 #[ignore = "needs time"]
 fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
     let workplace = Workplace::new();

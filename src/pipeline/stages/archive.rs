@@ -20,7 +20,7 @@ use crate::error::{Error, ErrorKind, Result};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::limits::{Limits, ReadLimit};
-use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::model::Attributes;
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::planning::Planning;
@@ -28,7 +28,8 @@ use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
     ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, BYTES_PER_PIXEL,
-    OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met, view_count,
+    ENOUGH_PSNR, OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met,
+    view_count,
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::progress::Progress;
@@ -43,6 +44,11 @@ const NAME: &str = "archive";
 /// with this value, quantization then costs 0.5 and 1.2 dB PSNR on two trained models.
 const ESTIMATE_OCTAVES: f64 = 3.3;
 
+/// Name, in notes about omitted work, of the refinement for quantization steps.
+const REFINEMENT: &str = "refinement of quantized values";
+/// Number of refinements for quantization steps that a run usually makes to find how coarse the steps may be.
+const ATTEMPTS_USUALLY_MADE: f64 = 1.5;
+
 /// Stage that quantizes and encodes the result as an archive.
 #[derive(Debug, Clone)]
 pub struct ArchiveStage {
@@ -55,17 +61,17 @@ pub struct ArchiveStage {
 
 /// Adds the stage that makes an archive to `stages` if the output is an archive. The parameters are refined for their
 /// quantization steps if the run refines toward renders, no PSNR against the result before quantization is requested,
-/// and there is memory for it.
+/// the archive stores a model, and there is memory for it.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.output != OutputKind::Archive {
         return;
     }
     let psnr = planning.request.archive_psnr;
-    let mut refine = planning.refine.as_ref().and_then(RefineStage::for_archive);
-    if psnr.is_some() || planning.request.photographs.is_some() {
+    let mut refine = planning.refine.as_ref().and_then(|refine| refine.for_archive(planning.searches()));
+    if psnr.is_some() || planning.request.photographs.is_some() || planning.input.archives_as_frames {
         refine = None;
     } else if refine.is_some() && !planning.refines_archive {
-        stages.leave_out("refinement of quantized values", "memory: it does not fit within the limit (--memory)");
+        stages.leave_out(REFINEMENT, "memory: it does not fit within the limit (--memory)");
         refine = None;
     }
     stages.add(Phase::Write, ArchiveStage { psnr, refine });
@@ -93,8 +99,10 @@ impl Stage for ArchiveStage {
         let (archived, archive) = self.archive(run.scene, &run.result, asked, &fixed, &mut run.journal)?;
         if let Some(goal) = &mut run.goal {
             (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
+            let what =
+                if archive.is_refined { "quantization and refinement for it cost" } else { "quantization costs" };
             run.journal.notes.push(format!(
-                "archive: quantization costs {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at \
+                "archive: {what} {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at \
                  least {} dB PSNR requested, {:.2} dB on the views of the search, {:.2} dB on the other views",
                 archive.loss, goal.asked, goal.searched, goal.held
             ));
@@ -135,11 +143,12 @@ impl ArchiveStage {
             None => quantization,
             Some(refine) => {
                 let refinement = refine.resource_estimate(work, limits);
+                // Contents with rounded and with refined values, and values that are rounded for a step.
+                let refined = bytes_of_survivors(refine.target.unwrap_or(1.0), 5 * whole);
                 ResourceEstimate {
                     reads: quantization.reads + refinement.reads,
-                    seconds: quantization.seconds + refinement.seconds,
-                    // The contents with rounded and with refined values.
-                    per_gaussian: [quantization.per_gaussian, refinement.per_gaussian, vec![("contents", 2 * whole)]]
+                    seconds: quantization.seconds + ATTEMPTS_USUALLY_MADE * refinement.seconds,
+                    per_gaussian: [quantization.per_gaussian, refinement.per_gaussian, vec![("contents", refined)]]
                         .concat(),
                     fixed: [quantization.fixed, refinement.fixed].concat(),
                     ..quantization
@@ -179,6 +188,13 @@ impl ArchiveStage {
             };
             Ok(((archived, AsToml(summary)), compressed.len()))
         })?;
+        if self.refine.is_some() && !summary.is_refined {
+            let why = match summary.level >= ENOUGH_PSNR {
+                true => format!("the result has {:.1} dB PSNR vs. the original", summary.level),
+                false => "it did not meet the required quality or size".to_owned(),
+            };
+            journal.leave_out(REFINEMENT, why);
+        }
         Ok((archived, summary))
     }
 
@@ -197,7 +213,10 @@ impl ArchiveStage {
         let refinement = match (&self.refine, target) {
             // Refinement moves the result toward the original, away from the result before quantization.
             (None, _) | (_, QualityTarget::Close(_)) => None,
-            (Some(refine), _) => Some(ArchiveRefinement::new(scene, refine, compressed, fixed)?),
+            (Some(refine), _) => {
+                let has_held_views = matches!(archive_target, ArchiveTarget::Loss(_));
+                ArchiveRefinement::new(scene, refine, (compressed, fixed), original.views(), has_held_views)?
+            }
         };
         let required_psnr = match (target, &refinement) {
             (QualityTarget::Loss(most), Some(_)) => QualityTarget::Loss(loss_before_refinement(most)),
@@ -207,8 +226,9 @@ impl ArchiveStage {
         let mut grids = Grids::from_content(&content);
         let mut measured = Vec::new();
         let halvings = if matches!(target, QualityTarget::Bytes(_)) { BYTES_OCTAVE_HALVINGS } else { OCTAVE_HALVINGS };
-        let measurements = BALANCING_ROUNDS * grids.groups.len() + halvings;
-        let progress = scene.events.task(NAME, "measurements", measurements as u64);
+        let steps = refinement.as_ref().map_or(0, ArchiveRefinement::steps);
+        let total = BALANCING_ROUNDS * grids.groups.len() + halvings + steps;
+        let progress = scene.events.task(NAME, "steps", total as u64);
         for _ in 0..BALANCING_ROUNDS {
             measured =
                 grids.balance(scene, &reference_views, &mut content, 10f64.powf(-0.1 * required_psnr), &progress)?;
@@ -254,7 +274,7 @@ pub(super) struct Quantizer<'a> {
     original: ReferenceViews<'a>,
     /// PSNR of the result before quantization against the original, dB.
     level: f64,
-    progress: Progress,
+    pub(super) progress: Progress,
 }
 
 impl Quantizer<'_> {

@@ -5,41 +5,41 @@
 //! quantization grids in every render ([`RefineStage::refine_quantized`]). So an archive of a given quality may have
 //! coarser steps.
 
-use std::num::NonZeroU32;
-
 use super::archive::{MeasuredArchive, Quantizer};
 use super::reference_views::QualityTarget;
-use crate::archive::{self, ArchiveContent, QuantizationSteps};
+use crate::archive::{self, ATTRIBUTES, ArchiveContent, QuantizationSteps};
 use crate::compressed_model::{CompressedModel, ParamDelta};
 use crate::error::{ErrorKind, Result};
-use crate::model::Attributes;
+use crate::model::{Attributes, FrameView};
 use crate::progress::Progress;
 use crate::refinement::RefineStage;
-use crate::refinement::targets::Targets;
+use crate::refinement::targets::{Targets, ViewSplit};
 use crate::scene::Scene;
 
-/// Squared error of renders that quantization adds after refinement, divided by the one before it: an estimate, with
-/// which the first attempt chooses its quantization steps.
+/// Estimate of a ratio: the squared error of renders that quantization adds after refinement, divided by the error that
+/// it adds before. The first attempt chooses its quantization steps by it.
 const EXPECTED_ERROR_RATIO: f64 = 0.4;
-/// Maximum number of attempts to meet a maximum loss of PSNR with quantization steps as coarse as possible.
+/// Maximum number of attempts to find the coarsest quantization steps that meet a maximum loss of PSNR.
 const MAX_ATTEMPTS: usize = 3;
-/// Range of the factor on the error before refinement for the next attempt, if an attempt has missed the target.
+/// If the first attempt has missed the target, the next one allows less error before refinement. Range of the factor.
 const FINER: [f64; 2] = [0.25, 0.8];
-/// Minimum factor by which the error after refinement could grow within the target for which coarser quantization steps
-/// are tried.
+/// If an attempt has met the target, another one with coarser quantization steps is made only if the error that
+/// quantization adds after refinement could grow by at least this factor.
 const MIN_GROWTH: f64 = 1.6;
-/// Exponent p: attempts with coarser steps multiply the error before refinement by (the growth that the target allows
-/// for the error after refinement)^p. The error after refinement grows faster than the one before.
-const GROWTH_EXPONENT: f64 = 0.6;
-/// Maximum growth of the error after refinement that is used for the next attempt.
+/// Largest such factor from which the coarser quantization steps are derived.
 const MAX_GROWTH: f64 = 4.0;
-/// Parts of a byte limit that the archives have before refinement, one for each attempt. Refined values may take a few
-/// more bytes.
-const BYTES_PARTS: [f64; 2] = [0.995, 0.98];
+/// Exponent p: if the error after refinement may grow by the factor g, the next attempt allows g^p times the error
+/// before refinement. The error after refinement grows faster than the one before.
+const GROWTH_EXPONENT: f64 = 0.6;
+/// Fractions of a byte limit that an archive may take before refinement, one for each attempt. Refined values may take
+/// a few more bytes.
+const BYTES_FRACTIONS: [f64; 2] = [0.995, 0.98];
 /// Fraction of the optimization steps that refine all parameters. The others follow with fixed positions: the
 /// quantization grid of a texel depends on the positions, so the final values of the field are known only once the
 /// positions are.
 const FREE_POSITION_STEPS: f64 = 0.62;
+/// Index in [`ATTRIBUTES`] of the SH coefficients of degree 0; those of higher degrees follow.
+const FIRST_SH_ATTRIBUTE: usize = 4;
 /// Maximum number of target views. There are fewer steps than in a refinement from the beginning, so fewer views are
 /// enough.
 const MAX_TARGET_VIEWS: usize = 260;
@@ -63,11 +63,14 @@ fn loss_from_error(error: f64) -> f64 {
 
 impl RefineStage {
     /// Returns the refinement of this stage's parameters for the quantization steps of an archive; `None` if it has no
-    /// optimization steps.
-    pub(super) fn for_archive(&self) -> Option<RefineStage> {
+    /// optimization steps. `searches`: whether the run searches for the smallest model with a requested quality. The
+    /// target views are then those of the search, so that the views that the search holds back stay held back.
+    pub(super) fn for_archive(&self, searches: bool) -> Option<RefineStage> {
         let mut refine = self.clone().without_prune_steps().with_time_independent_deltas();
         refine.steps = self.archive_steps;
-        refine.target_views = refine.target_views.min(MAX_TARGET_VIEWS);
+        if !searches {
+            refine.target_views = refine.target_views.min(MAX_TARGET_VIEWS);
+        }
         (refine.steps > 0).then_some(refine)
     }
 
@@ -87,26 +90,50 @@ pub(super) struct ArchiveRefinement<'a> {
     /// Refinement of all parameters, and refinement without positions.
     parts: [RefineStage; 2],
     compressed: &'a CompressedModel,
+    /// For each Gaussian of `compressed`, whether it is protected, so that it is not changed.
     fixed: &'a [bool],
     targets: Targets,
+    views: ViewSplit,
 }
 
 impl<'a> ArchiveRefinement<'a> {
     /// Creates the refinement `refine` ([`RefineStage::for_archive`]) of the result `compressed`, and renders its
-    /// target views. `fixed`: whether each Gaussian is protected, so that it is not changed.
+    /// target views. Returns `None` if there are no training views.
+    /// - `fixed`: whether each Gaussian is protected, so that it is not changed.
+    /// - `compared`: views by which the quality of the archive is measured; they are not training views.
+    /// - `has_test_views`: whether one of every four target views is a test view, as in a search.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
     pub(super) fn new(
         scene: &'a Scene,
         refine: &RefineStage,
-        compressed: &'a CompressedModel,
-        fixed: &'a [bool],
-    ) -> Result<ArchiveRefinement<'a>> {
-        let stride: NonZeroU32 = refine.stored_stride(scene.workload().pixels, compressed.len());
-        let targets = Targets::new(scene, refine.target_views, stride, false)?;
+        (compressed, fixed): (&'a CompressedModel, &'a [bool]),
+        compared: &[FrameView],
+        has_test_views: bool,
+    ) -> Result<Option<ArchiveRefinement<'a>>> {
+        if scene.schedule.pair_count() == 0 {
+            return Ok(None);
+        }
+        let stride = refine.stored_stride(scene.workload().pixels, compressed.len());
+        let targets = Targets::new(scene, refine.target_views, stride, has_test_views)?;
+        let mut views = targets.split();
+        let is_compared = |k: usize| {
+            let is_same = |view: &FrameView| {
+                view.frame == targets.views[k].frame
+                    && scene.schedule.cameras[view.camera as usize] == *targets.camera(k)
+            };
+            compared.iter().any(is_same)
+        };
+        views.training.retain(|&k| !is_compared(k));
         let parts = refine.parts_with_and_without_positions();
-        Ok(ArchiveRefinement { scene, parts, compressed, fixed, targets })
+        let has_views = !views.training.is_empty();
+        Ok(has_views.then_some(ArchiveRefinement { scene, parts, compressed, fixed, targets, views }))
+    }
+
+    /// Returns the number of optimization steps of one attempt.
+    pub(super) fn steps(&self) -> usize {
+        self.parts.iter().map(|part| part.steps).sum()
     }
 
     /// Returns an archive of refined parameters that meets `target`; `None` if no attempt has met it.
@@ -122,9 +149,12 @@ impl<'a> ArchiveRefinement<'a> {
             QualityTarget::Close(_) => Ok(None),
             QualityTarget::Loss(most) => {
                 let allowed = error_from_loss(most);
-                let (mut error, mut best) = (allowed / EXPECTED_ERROR_RATIO, None);
+                let (mut error, mut best): (f64, Option<MeasuredArchive>) = (allowed / EXPECTED_ERROR_RATIO, None);
                 for _ in 0..MAX_ATTEMPTS {
                     let unrefined = quantizer.archive(QualityTarget::Loss(loss_from_error(error)))?;
+                    if best.as_ref().is_some_and(|best| best.steps == unrefined.steps) {
+                        break;
+                    }
                     let Some(refined) = self.refined(quantizer, unrefined.steps)? else { break };
                     let growth = allowed / error_from_loss(refined.loss).max(f64::MIN_POSITIVE);
                     let (is_met, was_met) = (refined.loss <= most, best.is_some());
@@ -136,12 +166,18 @@ impl<'a> ArchiveRefinement<'a> {
                         false if !was_met => growth.clamp(FINER[0], FINER[1]),
                         _ => break,
                     };
+                    // With so little error, values that are only quantized meet the target.
+                    if error <= allowed {
+                        break;
+                    }
                 }
                 Ok(best)
             }
             QualityTarget::Bytes(most) => {
-                for part in BYTES_PARTS {
-                    let Some((steps, encoded)) = quantizer.finest_within((part * most as f64) as u64)? else { break };
+                for fraction in BYTES_FRACTIONS {
+                    let Some((steps, encoded)) = quantizer.finest_within((fraction * most as f64) as u64)? else {
+                        break;
+                    };
                     let unrefined = quantizer.measure((steps.clone(), encoded))?;
                     let Some(refined) = self.refined(quantizer, steps)? else { break };
                     if refined.encoded.bytes.len() as u64 <= most {
@@ -157,13 +193,11 @@ impl<'a> ArchiveRefinement<'a> {
     /// if the reader of the model format refuses quantized values.
     fn refined(&self, quantizer: &Quantizer<'_>, steps: QuantizationSteps) -> Result<Option<MeasuredArchive>> {
         let scene = self.scene;
-        let total: usize = self.parts.iter().map(|part| part.steps).sum();
-        let progress = scene.events.task("archive", "steps", total as u64);
         let refine = || {
             let mut compressed = self.compressed.clone();
             let mut content = scene.input.archive_content(&compressed)?;
             for part in &self.parts {
-                let delta = self.refined_delta(part, &content, &steps, &progress)?;
+                let delta = self.refined_delta(part, &content, &steps, &quantizer.progress)?;
                 compressed.delta = std::mem::take(&mut compressed.delta).plus(delta);
                 content = scene.input.archive_content(&compressed)?;
             }
@@ -185,6 +219,16 @@ impl<'a> ArchiveRefinement<'a> {
         progress: &Progress,
     ) -> Result<ParamDelta> {
         let mut quantized = content.clone();
+        // Values that these steps do not change.
+        let is_unchanged = |&k: &usize| {
+            let degree = k.saturating_sub(FIRST_SH_ATTRIBUTE);
+            !part.columns.contains(archive::attribute(k)) || degree > part.sh_degree
+        };
+        let unchanged: Vec<usize> = (0..ATTRIBUTES.len()).filter(is_unchanged).collect();
+        archive::round_cloud(&mut quantized.cloud, &steps.cloud, &unchanged);
+        for (column, step) in quantized.columns.iter_mut().zip(&steps.columns) {
+            archive::round_column(column, *step);
+        }
         let mut rounded = content.cloud.clone();
         archive::round_cloud(&mut rounded, &steps.cloud, &[0]);
         let space = archive::field_box(content);
@@ -193,14 +237,8 @@ impl<'a> ArchiveRefinement<'a> {
             let tensor = archive::round_tensor(tensor, role, tensor_steps, &rounded.position, space);
             quantized.tensors.insert(name.clone(), tensor);
         }
-        for (column, step) in quantized.columns.iter_mut().zip(&steps.columns) {
-            archive::round_column(column, *step);
-        }
-        if !part.columns.contains(Attributes::POSITION) {
-            quantized.cloud.position = rounded.position;
-        }
         let source = self.scene.input.decode_frames(&quantized)?;
         let start = (quantized.cloud, steps.cloud);
-        part.refine_quantized(self.scene, &self.targets, &*source, start, self.fixed.to_vec(), progress)
+        part.refine_quantized(self.scene, (&self.targets, &self.views), &*source, start, self.fixed.to_vec(), progress)
     }
 }

@@ -23,7 +23,7 @@ const MAX_VIEW_BYTES: u64 = 128 << 20;
 const DEFAULT_LOSS: f64 = 0.5;
 /// PSNR of the result against the original, dB, above which the errors of pruning are too small to hide quantization
 /// noise. The archive then has to reach this PSNR against the result before quantization.
-const ENOUGH_PSNR: f64 = 50.0;
+pub(crate) const ENOUGH_PSNR: f64 = 50.0;
 /// Loss of PSNR, dB, that a run allows for the quantization of an archive. A search for a requested PSNR therefore
 /// looks for a model that exceeds the request by this amount. With this value, quantization may add a third of the
 /// squared error of pruning: 10·log10(1 + 1/3) ≈ 1.2. A third is the best trade-off: raising the error of pruning by
@@ -139,6 +139,11 @@ impl ReferenceViews<'_> {
             ReferenceViews { scene, views: select_evenly(&scene.schedule, count, 1), images: Vec::new() };
         reference_views.images = reference_views.render(source, |_, image| image)?;
         Ok(reference_views)
+    }
+
+    /// Returns the camera and frame of every view.
+    pub(crate) fn views(&self) -> &[FrameView] {
+        &self.views
     }
 
     fn render<T: Send>(&self, source: &dyn FrameSource, finish: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
