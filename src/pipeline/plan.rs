@@ -66,7 +66,7 @@ impl RunPlan {
     ///
     /// If none of them fits, returns the plan with full refinement. It is refused later with an error that names the
     /// smallest sufficient limit. The plan includes the measurement of the quality of the result, and the refinement of
-    /// the values of an archive for their quantization steps, if there is memory for them.
+    /// a result for the quantization of its archive, if there is memory for them.
     ///
     /// # Errors
     /// Fails in the cases in which [`RunPlan::new`] fails.

@@ -62,7 +62,7 @@ pub struct Planning<'a> {
     pub refine: Option<RefineStage>,
     /// Whether the quality of the result is measured before it is written.
     pub measures_quality: bool,
-    /// Whether there is memory to refine the values of an archive for their quantization steps.
+    /// Whether there is memory to refine the result for the quantization of its archive.
     pub refines_archive: bool,
     /// Parts of refinement that are omitted to stay within the memory limit (`--memory`).
     pub(super) fallback: MemoryFallback,
@@ -98,7 +98,7 @@ impl Planning<'_> {
 pub(super) struct OptionalWork {
     /// Measurement of the quality of the result.
     pub(super) quality: bool,
-    /// Refinement of the values of an archive for their quantization steps.
+    /// Refinement of the result for the quantization of its archive.
     pub(super) archive_refinement: bool,
 }
 

@@ -58,7 +58,7 @@ pub struct ArchiveSummary {
     pub level: f64,
     /// Amount by which quantization, with the refinement for it, lowers the PSNR against the original, dB.
     pub loss: f64,
-    /// Whether the parameters were refined for their quantization steps. `psnr` then also shows this change.
+    /// Whether the attributes were refined for the quantization. `psnr` then also shows this change.
     #[serde(default)]
     pub is_refined: bool,
     /// Number of bytes of each part of the archive: Gaussians, deformation field, everything else. `None` for an

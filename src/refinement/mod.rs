@@ -22,6 +22,7 @@ pub(crate) mod optimizer_state;
 pub(crate) mod photographs;
 pub(crate) mod prune_steps;
 mod quantized;
+mod rounding;
 mod run;
 mod survivors;
 pub(crate) mod targets;

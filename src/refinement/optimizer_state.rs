@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
 use super::loss::{Loss, RenderQuality, limit_slope};
-use super::quantized::Rounding;
+use super::rounding::Rounding;
 use super::targets::Targets;
 use crate::archive::CloudSteps;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};

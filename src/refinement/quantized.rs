@@ -10,10 +10,10 @@ use super::optimizer::RateSchedule;
 use super::optimizer_state::OptimizerState;
 use super::run::{AVERAGE_EVERY, AVERAGED_FRACTION, EpochSampler, MeanDelta};
 use super::targets::{Targets, ViewSplit};
-use crate::archive::{self, ATTRIBUTES, CloudSteps};
+use crate::archive::CloudSteps;
 use crate::compressed_model::ParamDelta;
 use crate::error::Result;
-use crate::model::{AttributeValues, Attributes, Gaussians};
+use crate::model::Gaussians;
 use crate::progress::Progress;
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -22,55 +22,14 @@ use crate::source::FrameSource;
 /// refinement without rounding.
 const RATES: [f32; 2] = [0.25, 0.05];
 
-/// Rounding of the stored parameters of all Gaussians to quantization grids.
-#[derive(Debug)]
-pub(super) struct Rounding {
-    /// Stored parameters before the first optimization step.
-    start: Gaussians,
-    steps: CloudSteps,
-    /// Attributes that are rounded, as indices in [`ATTRIBUTES`].
-    attributes: Vec<usize>,
-}
-
-impl Rounding {
-    /// Creates a rounding of the stored parameters `start` to grids with the quantization steps `steps`. The optimizer
-    /// adds its deltas to the parameters `base`. Only attributes that have the same values in `start` and `base` are
-    /// rounded, and only those in `constant`: a format may store the others in other units, or for each frame.
-    pub(super) fn new(start: Gaussians, steps: CloudSteps, base: &Gaussians, constant: Attributes) -> Rounding {
-        let is_rounded = |k: &usize| {
-            let attribute = archive::attribute(*k);
-            constant.contains(attribute) && start.attribute_values(attribute) == base.attribute_values(attribute)
-        };
-        let attributes = (0..ATTRIBUTES.len()).filter(is_rounded).collect();
-        Rounding { start, steps, attributes }
-    }
-
-    /// Returns the delta that replaces `delta` so that its sum with the start parameters and `baked` is on the
-    /// quantization grids.
-    pub(super) fn rounded_delta(&self, baked: &ParamDelta, delta: &ParamDelta) -> ParamDelta {
-        let mut base = self.start.clone();
-        baked.add_to(&mut base, Attributes::all());
-        let mut rounded = base.clone();
-        delta.add_to(&mut rounded, Attributes::all());
-        archive::round_cloud(&mut rounded, &self.steps, &self.attributes);
-        let mut difference = ParamDelta::default();
-        for column in delta.attributes().iter() {
-            let width = delta.0.attribute_values(column).width();
-            let (to, from) = (rounded.attribute_values(column), base.attribute_values(column));
-            let values = (0..width).flat_map(|c| to.plane(c).iter().zip(from.plane(c)).map(|(to, from)| to - from));
-            *difference.0.attribute_values_mut(column) = AttributeValues::from_planes(width, values.collect());
-        }
-        difference
-    }
-}
-
 impl RefineStage {
     /// Refines the attributes [`RefineStage::columns`] of a model by [`RefineStage::steps`] optimization steps, so that
     /// the model is close to the target views after these attributes have been rounded. Returns the delta: values to
     /// add to the parameters `start`, before rounding. It is a mean over the last steps.
     /// - `result`: reader of the frames of the model. Values that the steps do not change, such as a deformation field,
     ///   must be rounded already.
-    /// - `start`: stored parameters of the model, not rounded. `quantization`: quantization steps of its attributes.
+    /// - `start`: stored parameters of the model that `result` reads. Attributes that the steps change are not rounded;
+    ///   all others are. `quantization`: quantization steps of the attributes.
     /// - `fixed`: whether each Gaussian is protected, that is, not changed.
     /// - `views`: training and validation views. The error of the validation views sets the learning rates.
     ///
@@ -105,38 +64,10 @@ impl RefineStage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::Attributes;
     use crate::pipeline::tests::{scene, score_scene};
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
-
-    /// Returns Gaussians with 0, 1, 2, … times `step` as values of all attributes.
-    fn ramp(count: usize, step: f32) -> Gaussians {
-        let mut ramp = Gaussians::zeros(count, 1);
-        for column in ramp.selected_attribute_values_mut(Attributes::all()) {
-            column.planes_mut().iter_mut().enumerate().for_each(|(k, value)| *value = k as f32 * step + 0.2531);
-        }
-        ramp
-    }
-
-    #[test]
-    fn rounded_parameters_are_on_the_grid_and_others_stay() {
-        let (start, mut state) = (ramp(5, 0.375), ramp(5, 0.375));
-        state.opacity_logit.planes_mut()[0] += 1.0;
-        // Steps of 1: 2^(0/8).
-        let rounding = Rounding::new(start.clone(), [0; ATTRIBUTES.len()], &state, Attributes::all());
-        let (baked, delta) = (ParamDelta(ramp(5, 0.11)), ParamDelta(ramp(5, 0.07)));
-        let rounded = rounding.rounded_delta(&baked, &delta);
-        for column in Attributes::all().iter() {
-            let values = |gaussians: &Gaussians| gaussians.attribute_values(column).planes().to_vec();
-            let [start, baked, delta, rounded] = [&start, &baked.0, &delta.0, &rounded.0].map(values);
-            for k in 0..start.len() {
-                let [exact, sum] =
-                    [delta[k], rounded[k]].map(|delta| f64::from(start[k] + baked[k]) + f64::from(delta));
-                let expected = if column == Attributes::OPACITY { exact } else { exact.round() };
-                assert!((sum - expected).abs() < 1e-5, "{column:?} {k}: {exact} to {sum}");
-            }
-        }
-    }
 
     #[test]
     fn refined_parameters_render_better_after_rounding() {

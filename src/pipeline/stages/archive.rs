@@ -14,12 +14,13 @@
 use super::archive_grids::Grids;
 use super::archive_refinement::{ArchiveRefinement, loss_before_refinement};
 use super::bounds;
-use crate::archive::{self, ArchiveContent, EncodedArchive, QuantizationSteps};
+use super::quantizer::{MeasuredArchive, Quantizer};
+use crate::archive::{self, EncodedArchive};
 use crate::compressed_model::CompressedModel;
-use crate::error::{Error, ErrorKind, Result};
+use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
-use crate::limits::{Limits, ReadLimit};
+use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::model::Attributes;
 use crate::outputs::kind::OutputKind;
@@ -27,12 +28,10 @@ use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
-    ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, BYTES_PER_PIXEL,
-    ENOUGH_PSNR, OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met,
-    view_count,
+    ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_PER_PIXEL, ENOUGH_PSNR,
+    OCTAVE_HALVINGS, QualityTarget, ReferenceViews, check_measurable, check_met, view_count,
 };
 use crate::pipeline::summary::ArchiveSummary;
-use crate::progress::Progress;
 use crate::refinement::RefineStage;
 use crate::render;
 use crate::scene::Scene;
@@ -44,9 +43,9 @@ const NAME: &str = "archive";
 /// with this value, quantization then costs 0.5 and 1.2 dB PSNR on two trained models.
 const ESTIMATE_OCTAVES: f64 = 3.3;
 
-/// Name, in notes about omitted work, of the refinement for quantization steps.
+/// Name, in notes about omitted work, of the refinement for the quantization of an archive.
 const REFINEMENT: &str = "refinement of quantized values";
-/// Number of refinements for quantization steps that a run usually makes to find how coarse the steps may be.
+/// Usual number of attempts (`archive_refinement`) to find how coarse the quantization steps may be.
 const ATTEMPTS_USUALLY_MADE: f64 = 1.5;
 
 /// Stage that quantizes and encodes the result as an archive.
@@ -55,7 +54,7 @@ pub struct ArchiveStage {
     /// Required PSNR, dB, of renders of the archive against renders of the result before quantization. `None`: derived
     /// from the goal of the run or from a default.
     pub psnr: Option<f64>,
-    /// Refinement of the parameters for their quantization steps; `None` if they are only quantized.
+    /// Refinement of the attributes for the quantization of the archive; `None` if they are only quantized.
     pub refine: Option<RefineStage>,
 }
 
@@ -189,9 +188,10 @@ impl ArchiveStage {
             Ok(((archived, AsToml(summary)), compressed.len()))
         })?;
         if self.refine.is_some() && !summary.is_refined {
-            let why = match summary.level >= ENOUGH_PSNR {
+            let is_close = summary.level >= ENOUGH_PSNR && archive_target == ArchiveTarget::Nothing;
+            let why = match is_close {
                 true => format!("the result has {:.1} dB PSNR vs. the original", summary.level),
-                false => "it did not meet the required quality or size".to_owned(),
+                false => "it would not have met the requested quality or size with fewer bytes or more PSNR".to_owned(),
             };
             journal.leave_out(REFINEMENT, why);
         }
@@ -214,8 +214,8 @@ impl ArchiveStage {
             // Refinement moves the result toward the original, away from the result before quantization.
             (None, _) | (_, QualityTarget::Close(_)) => None,
             (Some(refine), _) => {
-                let has_held_views = matches!(archive_target, ArchiveTarget::Loss(_));
-                ArchiveRefinement::new(scene, refine, (compressed, fixed), original.views(), has_held_views)?
+                let has_test_views = matches!(archive_target, ArchiveTarget::Loss(_));
+                ArchiveRefinement::new(scene, refine, (compressed, fixed), original.views(), has_test_views)?
             }
         };
         let required_psnr = match (target, &refinement) {
@@ -226,7 +226,7 @@ impl ArchiveStage {
         let mut grids = Grids::from_content(&content);
         let mut measured = Vec::new();
         let halvings = if matches!(target, QualityTarget::Bytes(_)) { BYTES_OCTAVE_HALVINGS } else { OCTAVE_HALVINGS };
-        let steps = refinement.as_ref().map_or(0, ArchiveRefinement::steps);
+        let steps = refinement.as_ref().map_or(0, ArchiveRefinement::optimization_steps);
         let total = BALANCING_ROUNDS * grids.groups.len() + halvings + steps;
         let progress = scene.events.task(NAME, "steps", total as u64);
         for _ in 0..BALANCING_ROUNDS {
@@ -252,85 +252,6 @@ impl ArchiveStage {
     }
 }
 
-/// Encoded archive with its quality.
-pub(super) struct MeasuredArchive {
-    pub(super) encoded: EncodedArchive,
-    /// Quantization steps of the archive.
-    pub(super) steps: QuantizationSteps,
-    /// PSNR of its renders against renders of the result before quantization, dB.
-    psnr: f64,
-    /// Amount by which its PSNR against the original is below that of the result before quantization, dB.
-    pub(super) loss: f64,
-}
-
-/// Quantization of the content of an archive, with everything that is needed to measure its effect on renders.
-pub(super) struct Quantizer<'a> {
-    scene: &'a Scene,
-    content: &'a ArchiveContent,
-    grids: Grids,
-    /// Renders of the result before quantization.
-    reference_views: ReferenceViews<'a>,
-    /// Renders of the original from the same cameras.
-    original: ReferenceViews<'a>,
-    /// PSNR of the result before quantization against the original, dB.
-    level: f64,
-    pub(super) progress: Progress,
-}
-
-impl Quantizer<'_> {
-    /// Encodes the content with all quantization steps made coarser by `added` octaves (doublings).
-    fn encode(&self, added: f64) -> Result<(QuantizationSteps, EncodedArchive)> {
-        self.progress.advance(1);
-        let steps = self.grids.steps(added);
-        let encoded = archive::encode(self.content, &steps)?;
-        Ok((steps, encoded))
-    }
-
-    /// Decodes the archive `encoded`, whose quantization steps are `steps`, and measures the quality of its renders.
-    ///
-    /// # Errors
-    /// Fails if the model format refuses the decoded values (an input error), or if frames cannot be read.
-    pub(super) fn measure(&self, (steps, encoded): (QuantizationSteps, EncodedArchive)) -> Result<MeasuredArchive> {
-        let (decoded, _) = archive::decode(&encoded.bytes, &self.scene.path, ReadLimit::NONE)?;
-        let shown = self.scene.input.decode_frames(&decoded)?;
-        let (psnr, loss) = (self.reference_views.psnr(&*shown)?, self.level - self.original.psnr(&*shown)?);
-        Ok(MeasuredArchive { encoded, steps, psnr, loss })
-    }
-
-    /// Returns the archive with the coarsest quantization steps that meets `target`, or, if it is a number of bytes,
-    /// the one with the finest steps. If no tried archive meets a quality, returns the one with the finest steps.
-    ///
-    /// # Errors
-    /// Fails if even the coarsest archive exceeds a byte limit, or if frames cannot be read.
-    pub(super) fn archive(&self, target: QualityTarget) -> Result<MeasuredArchive> {
-        if let QualityTarget::Bytes(most) = target {
-            return self.measure(match self.finest_within(most)? {
-                Some(best) => best,
-                None => {
-                    let (steps, encoded) = self.encode(BYTES_OCTAVE_RANGE[0])?;
-                    (steps, check_coarsest(encoded, most, self.content.cloud.len())?)
-                }
-            });
-        }
-        let required_psnr = target.required_psnr(self.level);
-        let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| match self.measure(self.encode(added)?) {
-            // The reader of a model format may refuse values that coarse steps have made zero.
-            Err(error) if error.kind() == ErrorKind::Input => Ok(None),
-            Err(error) => Err(error),
-            Ok(found) => Ok(Some(found).filter(|found| target.is_met_by([found.psnr, found.loss], required_psnr))),
-        })?;
-        best.map_or_else(|| self.measure(self.encode(OCTAVE_RANGE[0])?), Ok)
-    }
-
-    /// Returns the archive with the finest quantization steps that has at most `most` bytes; `None` if no tried one has
-    /// so few.
-    pub(super) fn finest_within(&self, most: u64) -> Result<Option<(QuantizationSteps, EncodedArchive)>> {
-        bisect(BYTES_OCTAVE_RANGE.map(|added| -added), BYTES_OCTAVE_HALVINGS, |finer| {
-            Ok(Some(self.encode(-finer)?).filter(|(_, encoded)| encoded.bytes.len() as u64 <= most))
-        })
-    }
-}
-
 /// Returns the estimated size, in bytes, of an archive of `compressed`: the size with fixed quantization steps or error
 /// bounds, for which nothing has to be rendered.
 ///
@@ -342,17 +263,4 @@ pub fn estimated_bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u6
     }
     let content = scene.input.archive_content(compressed)?;
     Ok(archive::encode(&content, &Grids::from_content(&content).steps(ESTIMATE_OCTAVES))?.bytes.len() as u64)
-}
-
-/// Checks that `encoded`, the archive of `gaussians` Gaussians with the coarsest quantization steps, has at most `most`
-/// bytes, and returns it. Fails if it has more.
-fn check_coarsest(encoded: EncodedArchive, most: u64, gaussians: usize) -> Result<EncodedArchive> {
-    let least = encoded.bytes.len();
-    if least as u64 > most {
-        return Err(Error::usage(format!(
-            "--size: expected at least {least} bytes, the size of an archive of {gaussians} Gaussians with the \
-             coarsest quantization, found {most}"
-        )));
-    }
-    Ok(encoded)
 }

@@ -1,11 +1,14 @@
-//! Refinement of the parameters in an archive for their quantization steps.
+//! Refinement of a result for the quantization of its archive (quantization-aware fine-tuning).
 //!
-//! Quantization changes the deformation field and the other values of a model together. The stored parameters of the
-//! Gaussians can make up for most of this: they are optimized again with the quantized field, and rounded to their
-//! quantization grids in every render ([`RefineStage::refine_quantized`]). So an archive of a given quality may have
-//! coarser steps.
+//! The deformation field and the further columns are quantized and then stay fixed. Optimization steps move the
+//! attributes of the Gaussians so that renders of their rounded values are close to the original
+//! ([`RefineStage::refine_quantized`]). This removes most of the error that quantization adds.
+//!
+//! [`ArchiveRefinement::refined_archive`] tries several sets of quantization steps. Each attempt starts from the
+//! unquantized result, refines it, encodes it and measures it. For a maximum loss of PSNR, the archive becomes smaller,
+//! because coarser steps suffice. For a byte limit, its PSNR becomes higher.
 
-use super::archive::{MeasuredArchive, Quantizer};
+use super::quantizer::{MeasuredArchive, Quantizer};
 use super::reference_views::QualityTarget;
 use crate::archive::{self, ATTRIBUTES, ArchiveContent, QuantizationSteps};
 use crate::compressed_model::{CompressedModel, ParamDelta};
@@ -21,27 +24,27 @@ use crate::scene::Scene;
 const EXPECTED_ERROR_RATIO: f64 = 0.4;
 /// Maximum number of attempts to find the coarsest quantization steps that meet a maximum loss of PSNR.
 const MAX_ATTEMPTS: usize = 3;
-/// If the first attempt has missed the target, the next one allows less error before refinement. Range of the factor.
-const FINER: [f64; 2] = [0.25, 0.8];
-/// If an attempt has met the target, another one with coarser quantization steps is made only if the error that
-/// quantization adds after refinement could grow by at least this factor.
+/// Limits of the factor on the error before refinement, from an attempt that misses the target to the next one. Used
+/// until an attempt meets the target. The factor is the allowed error divided by the error after refinement.
+const MISS_FACTOR_RANGE: [f64; 2] = [0.25, 0.8];
+/// An attempt that meets the target is followed by one with coarser quantization steps if the allowed error, divided by
+/// the error after refinement, is at least this value.
 const MIN_GROWTH: f64 = 1.6;
-/// Largest such factor from which the coarser quantization steps are derived.
+/// Upper limit of this quotient g when the next quantization steps are computed from it.
 const MAX_GROWTH: f64 = 4.0;
-/// Exponent p: if the error after refinement may grow by the factor g, the next attempt allows g^p times the error
-/// before refinement. The error after refinement grows faster than the one before.
+/// Exponent p: the next attempt allows g^p times the error before refinement. p is below 1 because the error after
+/// refinement grows faster than the error before.
 const GROWTH_EXPONENT: f64 = 0.6;
 /// Fractions of a byte limit that an archive may take before refinement, one for each attempt. Refined values may take
 /// a few more bytes.
 const BYTES_FRACTIONS: [f64; 2] = [0.995, 0.98];
-/// Fraction of the optimization steps that refine all parameters. The others follow with fixed positions: the
-/// quantization grid of a texel depends on the positions, so the final values of the field are known only once the
-/// positions are.
-const FREE_POSITION_STEPS: f64 = 0.62;
+/// Fraction of the optimization steps that also move positions. In the remaining steps, positions are fixed and the
+/// deformation field has its final values: the quantization grids of its feature planes depend on the positions.
+const FREE_POSITION_FRACTION: f64 = 0.62;
 /// Index in [`ATTRIBUTES`] of the SH coefficients of degree 0; those of higher degrees follow.
 const FIRST_SH_ATTRIBUTE: usize = 4;
-/// Maximum number of target views. There are fewer steps than in a refinement from the beginning, so fewer views are
-/// enough.
+/// Maximum number of target views, except in a search. This refinement has fewer steps than the main one (method.md,
+/// section 6.2), so fewer views are enough.
 const MAX_TARGET_VIEWS: usize = 260;
 
 /// Returns the loss of PSNR, dB, that quantization may cause before refinement if it is to cause at most `most` after
@@ -62,9 +65,10 @@ fn loss_from_error(error: f64) -> f64 {
 }
 
 impl RefineStage {
-    /// Returns the refinement of this stage's parameters for the quantization steps of an archive; `None` if it has no
-    /// optimization steps. `searches`: whether the run searches for the smallest model with a requested quality. The
-    /// target views are then those of the search, so that the views that the search holds back stay held back.
+    /// Returns a copy of this stage that refines a result for the quantization of its archive, in `archive_steps` steps
+    /// without prune steps; `None` if there are no such steps. `searches`: whether the run searches for the smallest
+    /// model with a requested quality. The number of target views then stays that of the search. Otherwise other target
+    /// views would be chosen, and test views of the search could become training views.
     pub(super) fn for_archive(&self, searches: bool) -> Option<RefineStage> {
         let mut refine = self.clone().without_prune_steps().with_time_independent_deltas();
         refine.steps = self.archive_steps;
@@ -77,14 +81,14 @@ impl RefineStage {
     /// Returns the two parts of this refinement ([`RefineStage::for_archive`]): with and without positions.
     fn parts_with_and_without_positions(&self) -> [RefineStage; 2] {
         let [mut with, mut without] = [self.clone(), self.clone()];
-        with.steps = (FREE_POSITION_STEPS * self.steps as f64).ceil() as usize;
+        with.steps = (FREE_POSITION_FRACTION * self.steps as f64).ceil() as usize;
         without.steps -= with.steps;
         without.columns.remove(Attributes::POSITION);
         [with, without]
     }
 }
 
-/// Refinement of a result for the quantization steps of its archive.
+/// Refinement of a result for the quantization of its archive.
 pub(super) struct ArchiveRefinement<'a> {
     scene: &'a Scene,
     /// Refinement of all parameters, and refinement without positions.
@@ -100,7 +104,7 @@ impl<'a> ArchiveRefinement<'a> {
     /// Creates the refinement `refine` ([`RefineStage::for_archive`]) of the result `compressed`, and renders its
     /// target views. Returns `None` if there are no training views.
     /// - `fixed`: whether each Gaussian is protected, so that it is not changed.
-    /// - `compared`: views by which the quality of the archive is measured; they are not training views.
+    /// - `compared`: views by which the quality of the archive is measured; they are removed from the training views.
     /// - `has_test_views`: whether one of every four target views is a test view, as in a search.
     ///
     /// # Errors
@@ -132,11 +136,14 @@ impl<'a> ArchiveRefinement<'a> {
     }
 
     /// Returns the number of optimization steps of one attempt.
-    pub(super) fn steps(&self) -> usize {
+    pub(super) fn optimization_steps(&self) -> usize {
         self.parts.iter().map(|part| part.steps).sum()
     }
 
-    /// Returns an archive of refined parameters that meets `target`; `None` if no attempt has met it.
+    /// Returns the refined archive that meets `target`. For a maximum loss, this is the archive of the last attempt that
+    /// meets it, which has the coarsest quantization steps. Returns `None` if no attempt meets the target, if a refined
+    /// archive within a byte limit is not better than the unrefined one, if the reader of the model format refuses
+    /// quantized values, or if `target` compares with the result before quantization.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -163,7 +170,7 @@ impl<'a> ArchiveRefinement<'a> {
                     }
                     error *= match is_met {
                         true if growth >= MIN_GROWTH => growth.min(MAX_GROWTH).powf(GROWTH_EXPONENT),
-                        false if !was_met => growth.clamp(FINER[0], FINER[1]),
+                        false if !was_met => growth.clamp(MISS_FACTOR_RANGE[0], MISS_FACTOR_RANGE[1]),
                         _ => break,
                     };
                     // With so little error, values that are only quantized meet the target.
@@ -189,19 +196,19 @@ impl<'a> ArchiveRefinement<'a> {
         }
     }
 
-    /// Returns the archive with the quantization steps `steps` of parameters that are refined for them. Returns `None`
-    /// if the reader of the model format refuses quantized values.
-    fn refined(&self, quantizer: &Quantizer<'_>, steps: QuantizationSteps) -> Result<Option<MeasuredArchive>> {
+    /// Refines the result for the quantization steps `quantization`, and returns its encoded and measured archive.
+    /// Returns `None` if the reader of the model format refuses quantized values.
+    fn refined(&self, quantizer: &Quantizer<'_>, quantization: QuantizationSteps) -> Result<Option<MeasuredArchive>> {
         let scene = self.scene;
         let refine = || {
             let mut compressed = self.compressed.clone();
             let mut content = scene.input.archive_content(&compressed)?;
             for part in &self.parts {
-                let delta = self.refined_delta(part, &content, &steps, &quantizer.progress)?;
+                let delta = self.refined_delta(part, &content, &quantization, &quantizer.progress)?;
                 compressed.delta = std::mem::take(&mut compressed.delta).plus(delta);
                 content = scene.input.archive_content(&compressed)?;
             }
-            quantizer.measure((steps.clone(), archive::encode(&content, &steps)?))
+            quantizer.measure((quantization.clone(), archive::encode(&content, &quantization)?))
         };
         match refine() {
             Err(error) if error.kind() == ErrorKind::Input => Ok(None),
@@ -209,36 +216,37 @@ impl<'a> ArchiveRefinement<'a> {
         }
     }
 
-    /// Refines the parameters in `content` by the optimization steps of `part`, for the quantization steps `steps`.
-    /// Returns what refinement adds to them.
+    /// Refines the attributes of `content` with the optimization steps of `part`. Renders use values that are rounded
+    /// with `quantization`. Returns the parameter delta: values to add to the attributes before they are rounded.
     fn refined_delta(
         &self,
         part: &RefineStage,
         content: &ArchiveContent,
-        steps: &QuantizationSteps,
+        quantization: &QuantizationSteps,
         progress: &Progress,
     ) -> Result<ParamDelta> {
-        let mut quantized = content.clone();
-        // Values that these steps do not change.
+        let mut start_content = content.clone();
+        // Indices in ATTRIBUTES of the attributes and SH degrees that `part` does not optimize. They are rounded once.
         let is_unchanged = |&k: &usize| {
             let degree = k.saturating_sub(FIRST_SH_ATTRIBUTE);
             !part.columns.contains(archive::attribute(k)) || degree > part.sh_degree
         };
         let unchanged: Vec<usize> = (0..ATTRIBUTES.len()).filter(is_unchanged).collect();
-        archive::round_cloud(&mut quantized.cloud, &steps.cloud, &unchanged);
-        for (column, step) in quantized.columns.iter_mut().zip(&steps.columns) {
+        archive::round_cloud(&mut start_content.cloud, &quantization.cloud, &unchanged);
+        for (column, step) in start_content.columns.iter_mut().zip(&quantization.columns) {
             archive::round_column(column, *step);
         }
+        // The grids of the field depend on the positions as they will be decoded (attribute 0).
         let mut rounded = content.cloud.clone();
-        archive::round_cloud(&mut rounded, &steps.cloud, &[0]);
+        archive::round_cloud(&mut rounded, &quantization.cloud, &[0]);
         let space = archive::field_box(content);
-        for (name, tensor_steps) in &steps.field.0 {
+        for (name, tensor_steps) in &quantization.field.0 {
             let (tensor, role) = (&content.tensors[name], content.field[name]);
             let tensor = archive::round_tensor(tensor, role, tensor_steps, &rounded.position, space);
-            quantized.tensors.insert(name.clone(), tensor);
+            start_content.tensors.insert(name.clone(), tensor);
         }
-        let source = self.scene.input.decode_frames(&quantized)?;
-        let start = (quantized.cloud, steps.cloud);
+        let source = self.scene.input.decode_frames(&start_content)?;
+        let start = (start_content.cloud, quantization.cloud);
         part.refine_quantized(self.scene, (&self.targets, &self.views), &*source, start, self.fixed.to_vec(), progress)
     }
 }

@@ -14,6 +14,7 @@ pub(crate) mod merge;
 pub(crate) mod photographs;
 pub(crate) mod prune;
 pub(crate) mod quality;
+mod quantizer;
 pub(crate) mod reference_views;
 pub(crate) mod refine;
 pub(crate) mod rounds;
