@@ -4,10 +4,11 @@
     cargo build --release
     python3 scripts/benchmark/equal_bytes.py target/release/splatsieve DATA [--models A,B] [--kept 10%] [--splat-transform COMMAND]
 
-Methods: the archive (.gsz) of `default`; the same without refinement for the quantization steps; the result of pruning only (--no-refine --prune-only, exact field), compressed
-by xz of the standard library; of static models also what COMMAND, a splat-transform of PlayCanvas, makes of as many
-Gaussians (.sog and .spz, decimated by that program, without cameras). `part` is the fraction of the bytes of the files
-that a renderer opens. PSNR is the mean over test views, against renders of the original.
+Methods: the archive (.gsz) of `default`; the same without refinement for the quantization; the result of pruning only
+(--no-refine --prune-only, exact field), compressed by xz of the standard library; of static models also what COMMAND, a
+splat-transform of PlayCanvas, makes of as many Gaussians (.sog and .spz, decimated by that program, without cameras).
+`part` is the fraction of the bytes of the files that a renderer opens. PSNR is the mean over test views, against
+renders of the original.
 """
 
 import lzma

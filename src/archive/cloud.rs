@@ -25,11 +25,14 @@ pub const ATTRIBUTES: [&str; 8] =
 /// [`super::step_size()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
+/// Index in [`ATTRIBUTES`] of the SH coefficients of degree 0; those of higher degrees follow.
+pub const FIRST_SH_ATTRIBUTE: usize = 4;
+
 /// Returns the attribute of the values whose name is [`ATTRIBUTES`]`[k]`.
 pub fn attribute(k: usize) -> Attributes {
-    const IN_ORDER: [Attributes; 5] =
-        [Attributes::POSITION, Attributes::ROTATION, Attributes::LOG_SCALE, Attributes::OPACITY, Attributes::SH];
-    IN_ORDER[k.min(IN_ORDER.len() - 1)]
+    const BEFORE_SH: [Attributes; FIRST_SH_ATTRIBUTE] =
+        [Attributes::POSITION, Attributes::ROTATION, Attributes::LOG_SCALE, Attributes::OPACITY];
+    BEFORE_SH.get(k).copied().unwrap_or(Attributes::SH)
 }
 
 /// Number of known values from which a value is predicted:
@@ -108,7 +111,10 @@ fn attribute_planes(sh_degree: usize) -> Vec<Plane> {
     let mut planes: Vec<_> = (0..4).map(|c| plane(Attributes::ROTATION, c, 1)).collect();
     planes.extend((0..3).map(|c| plane(Attributes::LOG_SCALE, c, 2)));
     planes.push(plane(Attributes::OPACITY, 0, 3));
-    planes.extend((0..3 * sh_coefficient_count(sh_degree)).map(|c| plane(Attributes::SH, c, 4 + (c / 3).isqrt())));
+    planes.extend(
+        (0..3 * sh_coefficient_count(sh_degree))
+            .map(|c| plane(Attributes::SH, c, FIRST_SH_ATTRIBUTE + (c / 3).isqrt())),
+    );
     planes
 }
 

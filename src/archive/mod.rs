@@ -25,7 +25,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use cloud::interleave_zeros;
-pub use cloud::{ATTRIBUTES, CloudSteps, Column, attribute};
+pub use cloud::{ATTRIBUTES, CloudSteps, Column, FIRST_SH_ATTRIBUTE, attribute};
 pub use field::{FieldSteps, TensorRole, TensorSteps, round_tensor};
 pub use file::{ArchiveSize, HEADER_BYTES, MAGIC, VERSION};
 pub use importance::step_offsets;

@@ -17,6 +17,7 @@
 
 mod local;
 mod loss;
+mod mean_delta;
 pub mod optimizer;
 pub(crate) mod optimizer_state;
 pub(crate) mod photographs;
@@ -97,7 +98,7 @@ pub struct RefineStage {
     /// that refinement adds to each frame, interpolated between keyframes. With 0 keyframes, all added values are
     /// constant in time.
     pub keyframes: usize,
-    /// Number of optimization steps that adapt the parameters to the quantization of an archive.
+    /// Number of optimization steps that refine the result again for the quantization of an archive.
     pub archive_steps: usize,
     /// Fraction of the Gaussians that the user wants to keep; `None` if not given.
     pub target: Option<f64>,

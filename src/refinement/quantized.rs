@@ -6,9 +6,10 @@
 //! other values that are quantized and stay as they are, render close to the target views.
 
 use super::RefineStage;
+use super::mean_delta::{MeanDelta, is_averaged};
 use super::optimizer::RateSchedule;
 use super::optimizer_state::OptimizerState;
-use super::run::{AVERAGE_EVERY, AVERAGED_FRACTION, EpochSampler, MeanDelta};
+use super::run::EpochSampler;
 use super::targets::{Targets, ViewSplit};
 use crate::archive::CloudSteps;
 use crate::compressed_model::ParamDelta;
@@ -49,10 +50,9 @@ impl RefineStage {
         let error = optimizer.quality(&views.validation)?.typical_error();
         let schedule = RateSchedule::new(self.steps, RATES[1] / RATES[0], error).scaled_by(RATES[0]);
         let (mut sampler, mut mean) = (EpochSampler::new(views.training.clone()), MeanDelta::default());
-        let averaged_after = self.steps - (self.steps as f64 * AVERAGED_FRACTION) as usize;
         for step in 1..=self.steps {
             optimizer.step(sampler.next(), &schedule)?;
-            if step > averaged_after && (step - averaged_after).is_multiple_of(AVERAGE_EVERY) || step == self.steps {
+            if is_averaged(step, self.steps) || step == self.steps {
                 mean.add(optimizer.change());
             }
             progress.advance(1);

@@ -64,7 +64,7 @@ mod tests {
     fn rounded_parameters_are_on_the_grid_and_others_stay() {
         let (start, mut state) = (ramp(5, 0.375), ramp(5, 0.375));
         state.opacity_logit.planes_mut()[0] += 1.0;
-        // Steps of 1: 2^(0/8).
+        // The exponent 0 stands for the quantization step 2^(0/8) = 1.
         let rounding = Rounding::new(start.clone(), [0; ATTRIBUTES.len()], &state, Attributes::all());
         let (baked, delta) = (ParamDelta(ramp(5, 0.11)), ParamDelta(ramp(5, 0.07)));
         let rounded = rounding.rounded_delta(&baked, &delta);

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::loss::RenderQuality;
+use super::mean_delta::{MeanDelta, is_averaged};
 use super::optimizer::RateSchedule;
 use super::optimizer_state::{LoadedCheckpoint, OptimizerState, keyframe_count};
 use super::survivors::survivors;
@@ -38,11 +39,6 @@ const RATE_REDUCTION: f32 = 0.3;
 /// Learning rate at the last optimization step of a phase, divided by the learning rate at its first step. First value:
 /// phase of the steps before a prune step; second value: phase of the final steps.
 const LAST_RATES: [f32; 2] = [1.0, 0.5];
-/// Fraction of the final steps, taken from their end, over which the parameters are averaged. The parameters after
-/// single steps scatter around the optimum; their mean is closer to it.
-pub(super) const AVERAGED_FRACTION: f64 = 0.4;
-/// Number of optimization steps between two parameter deltas that are averaged.
-pub(super) const AVERAGE_EVERY: usize = 4;
 
 impl RefineStage {
     /// Prunes the model `compressed` in prune steps to `target_count` Gaussians and refines it. Returns the model with
@@ -199,26 +195,6 @@ struct BestState<Delta, Trajectory> {
     /// together with `delta`.
     trajectory: Trajectory,
     mean: MeanDelta<Delta>,
-}
-
-/// Mean of parameter deltas (values that refinement adds to the parameters). One delta is taken after every
-/// [`AVERAGE_EVERY`]-th of the last optimization steps.
-#[derive(Clone, Default, Serialize, Deserialize)]
-pub(super) struct MeanDelta<Delta> {
-    pub(super) delta: Delta,
-    /// Number of parameter deltas of which `delta` is the mean so far.
-    count: u32,
-}
-
-impl MeanDelta<ParamDelta> {
-    /// Includes the parameter delta `next` in the mean.
-    pub(super) fn add(&mut self, mut next: ParamDelta) {
-        self.count += 1;
-        let part = 1.0 / self.count as f32;
-        self.delta.scale(1.0 - part);
-        next.scale(part);
-        self.delta = std::mem::take(&mut self.delta).plus(next);
-    }
 }
 
 /// Progress of a phase that continues from a checkpoint: number of optimization steps done, learning rates, and, in the
@@ -485,10 +461,9 @@ impl<'a> RefineRun<'a> {
             }
         };
         let validate_every = steps.div_ceil(3).clamp(VALIDATE_EVERY[0], VALIDATE_EVERY[1]);
-        let averaged_after = steps - (steps as f64 * AVERAGED_FRACTION) as usize;
         for step in done + 1..=steps {
             self.step(optimizer, &schedule)?;
-            if step > averaged_after && (step - averaged_after).is_multiple_of(AVERAGE_EVERY) {
+            if is_averaged(step, steps) {
                 best_state.mean.add(optimizer.change());
             }
             if step % validate_every == 0 || step == steps {

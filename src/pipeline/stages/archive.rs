@@ -8,8 +8,8 @@
 //! error on renders, and sets the steps by this rule. Then it makes all steps together as coarse as the quality of
 //! renders of the archive allows.
 //!
-//! If the result was refined, its parameters are then refined for these steps (`archive_refinement`), which allows
-//! coarser steps for the same quality.
+//! A refined result is refined again with these steps, so that it renders close to the original after quantization
+//! (`archive_refinement`). An archive of the same quality then needs fewer bytes.
 
 use super::archive_grids::Grids;
 use super::archive_refinement::{ArchiveRefinement, loss_before_refinement};
@@ -58,9 +58,9 @@ pub struct ArchiveStage {
     pub refine: Option<RefineStage>,
 }
 
-/// Adds the stage that makes an archive to `stages` if the output is an archive. The parameters are refined for their
-/// quantization steps if the run refines toward renders, no PSNR against the result before quantization is requested,
-/// the archive stores a model, and there is memory for it.
+/// Adds the stage that makes an archive to `stages` if the output is an archive. The stage refines the result for the
+/// quantization if four conditions hold: the run refines toward renders, no PSNR against the result before quantization
+/// is requested, the archive stores a model, and there is memory for the refinement.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.output != OutputKind::Archive {
         return;
@@ -157,7 +157,8 @@ impl ArchiveStage {
     }
 
     /// Makes an archive of `compressed` that meets the quality or size `archive_target`. Returns its content and its
-    /// summary. `fixed`: whether each Gaussian is protected, so that refinement does not change it.
+    /// summary. `fixed`: for each Gaussian of `compressed`, whether it is protected, that is, not changed by refinement;
+    /// not used without refinement.
     ///
     /// # Errors
     /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, if the

@@ -3,7 +3,9 @@
 
 use std::collections::BTreeMap;
 
-use crate::archive::{self, ATTRIBUTES, ArchiveContent, QuantizationSteps, STEP_NUMBERS, TensorRole, TensorSteps};
+use crate::archive::{
+    self, ATTRIBUTES, ArchiveContent, FIRST_SH_ATTRIBUTE, QuantizationSteps, STEP_NUMBERS, TensorRole, TensorSteps,
+};
 use crate::error::Result;
 use crate::pipeline::stages::reference_views::{ReferenceViews, step_change};
 use crate::progress::Progress;
@@ -171,7 +173,7 @@ impl Grids {
 }
 
 fn groups(content: &ArchiveContent) -> Vec<ValueGroup> {
-    let attributes = 4 + content.cloud.sh_degree() + 1;
+    let attributes = FIRST_SH_ATTRIBUTE + content.cloud.sh_degree() + 1;
     let tensors = content.field.iter().filter(|(_, role)| !matches!(role, TensorRole::Exact | TensorRole::Unread));
     let columns = content.columns.iter().enumerate().map(|(k, column)| ValueGroup::Column(k, column.name.clone()));
     (0..attributes)

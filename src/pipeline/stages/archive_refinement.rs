@@ -8,12 +8,14 @@
 //! unquantized result, refines it, encodes it and measures it. For a maximum loss of PSNR, the archive becomes smaller,
 //! because coarser steps suffice. For a byte limit, its PSNR becomes higher.
 
+use std::borrow::Cow;
+
 use super::quantizer::{MeasuredArchive, Quantizer};
-use super::reference_views::QualityTarget;
-use crate::archive::{self, ATTRIBUTES, ArchiveContent, QuantizationSteps};
+use super::reference_views::{QualityTarget, error_from_loss, loss_from_error};
+use crate::archive::{self, ATTRIBUTES, ArchiveContent, FIRST_SH_ATTRIBUTE, QuantizationSteps};
 use crate::compressed_model::{CompressedModel, ParamDelta};
 use crate::error::{ErrorKind, Result};
-use crate::model::{Attributes, FrameView};
+use crate::model::{Attributes, FrameView, Gaussians};
 use crate::progress::Progress;
 use crate::refinement::RefineStage;
 use crate::refinement::targets::{Targets, ViewSplit};
@@ -41,8 +43,6 @@ const BYTES_FRACTIONS: [f64; 2] = [0.995, 0.98];
 /// Fraction of the optimization steps that also move positions. In the remaining steps, positions are fixed and the
 /// deformation field has its final values: the quantization grids of its feature planes depend on the positions.
 const FREE_POSITION_FRACTION: f64 = 0.62;
-/// Index in [`ATTRIBUTES`] of the SH coefficients of degree 0; those of higher degrees follow.
-const FIRST_SH_ATTRIBUTE: usize = 4;
 /// Maximum number of target views, except in a search. This refinement has fewer steps than the main one (method.md,
 /// section 6.2), so fewer views are enough.
 const MAX_TARGET_VIEWS: usize = 260;
@@ -51,17 +51,6 @@ const MAX_TARGET_VIEWS: usize = 260;
 /// it.
 pub(super) fn loss_before_refinement(most: f64) -> f64 {
     loss_from_error(error_from_loss(most) / EXPECTED_ERROR_RATIO)
-}
-
-/// Returns the squared error that quantization adds if it lowers the PSNR by `loss` dB, as a fraction of the squared
-/// error before quantization.
-fn error_from_loss(loss: f64) -> f64 {
-    10f64.powf(0.1 * loss) - 1.0
-}
-
-/// Returns the loss of PSNR, dB, by a squared error `error`, as a fraction of the squared error before quantization.
-fn loss_from_error(error: f64) -> f64 {
-    10.0 * (1.0 + error).log10()
 }
 
 impl RefineStage {
@@ -201,12 +190,11 @@ impl<'a> ArchiveRefinement<'a> {
     fn refined(&self, quantizer: &Quantizer<'_>, quantization: QuantizationSteps) -> Result<Option<MeasuredArchive>> {
         let scene = self.scene;
         let refine = || {
-            let mut compressed = self.compressed.clone();
-            let mut content = scene.input.archive_content(&compressed)?;
+            let (mut compressed, mut content) = (self.compressed.clone(), Cow::Borrowed(quantizer.content));
             for part in &self.parts {
                 let delta = self.refined_delta(part, &content, &quantization, &quantizer.progress)?;
                 compressed.delta = std::mem::take(&mut compressed.delta).plus(delta);
-                content = scene.input.archive_content(&compressed)?;
+                content = Cow::Owned(scene.input.archive_content(&compressed)?);
             }
             quantizer.measure((quantization.clone(), archive::encode(&content, &quantization)?))
         };
@@ -237,7 +225,7 @@ impl<'a> ArchiveRefinement<'a> {
             archive::round_column(column, *step);
         }
         // The grids of the field depend on the positions as they will be decoded (attribute 0).
-        let mut rounded = content.cloud.clone();
+        let mut rounded = Gaussians { position: content.cloud.position.clone(), ..Gaussians::default() };
         archive::round_cloud(&mut rounded, &quantization.cloud, &[0]);
         let space = archive::field_box(content);
         for (name, tensor_steps) in &quantization.field.0 {

@@ -24,6 +24,7 @@ pub(super) struct MeasuredArchive {
 /// Quantization of the content of an archive, with everything that is needed to measure its effect on renders.
 pub(super) struct Quantizer<'a> {
     pub(super) scene: &'a Scene,
+    /// Content of the archive before quantization.
     pub(super) content: &'a ArchiveContent,
     pub(super) grids: Grids,
     /// Renders of the result before quantization.

@@ -119,10 +119,22 @@ impl QualityTarget {
         match self {
             QualityTarget::Close(psnr) => psnr,
             // The squared errors of pruning and of quantization add up.
-            QualityTarget::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
+            QualityTarget::Loss(loss) => level - 10.0 * error_from_loss(loss).log10(),
             QualityTarget::Bytes(_) => QualityTarget::Loss(ARCHIVE_HEADROOM).required_psnr(level.min(ENOUGH_PSNR)),
         }
     }
+}
+
+/// Returns the squared error that quantization adds if it lowers the PSNR by `loss` dB, as a fraction of the squared
+/// error before quantization.
+pub(crate) fn error_from_loss(loss: f64) -> f64 {
+    10f64.powf(0.1 * loss) - 1.0
+}
+
+/// Returns the loss of PSNR, dB, by the squared error `error` that quantization adds, as a fraction of the squared error
+/// before quantization. Inverse of [`error_from_loss`].
+pub(crate) fn loss_from_error(error: f64) -> f64 {
+    10.0 * (1.0 + error).log10()
 }
 
 /// Renders of one model (usually the result before quantization), with which renders of other models are compared.
