@@ -8,9 +8,11 @@
 Rows of kind `stage` add one stage after the other, from pruning by the paper's score to `default`, then take single
 parts of `default` away. Rows of kind `setting` change one parameter of `default`, and the first of them none; they are
 measured at 10% only, and `robustness.py` compares `default` with the best of them for each model. With `--kinds` the
-file has the named rows only; `--results` writes it into another folder. PSNR is the mean over test views.
+file has the named rows only; `--results` writes it into another folder. PSNR is the mean over test views. The runs of a
+model share a cache of stage results, which changes no result but saves time.
 """
 
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from measuring import KEPT, Results, arguments, chosen, compress, evaluate, word
 
 PRUNE = ["--no-refine", "--prune-only"]
 ROUNDS_OF_48_VIEWS = ["round_views=48", "round_groups=4"]
+ARCHIVE = "default, as archive"
 SETTINGS = {
     "default": [],
     "contrast_floor=0": ["contrast_floor=0"],
@@ -52,7 +55,11 @@ def stages(kept):
         "default, colors refined only": sets("refine=color"),
         "default, exact field": sets("field=exact"),
         "default, every SH degree": sets("bands=all"),
+        ARCHIVE: [],
         "default, rounds of 48 views": sets(*ROUNDS_OF_48_VIEWS),
+        "default, no views outside the rig": sets("outside=0"),
+        "default, no views between cameras": sets("refine_between=false"),
+        "default, without validation": sets("refine_validate=false"),
     }
 
 
@@ -64,19 +71,21 @@ def main():
     results = Results("ablation", args.program, columns)
     with tempfile.TemporaryDirectory() as scratch:
         for model in chosen(args, scratch):
-            output = Path(scratch) / f"small{model.suffix}"
+            small, archive, cache = (Path(scratch) / name for name in (f"small{model.suffix}", "small.gsz", "cache"))
             for kept in args.kept:
                 rows = [("stage", name, options) for name, options in stages(kept).items()]
                 if kept == "10%":
                     rows += [("setting", name, sets(*settings)) for name, settings in SETTINGS.items()]
                 rows = [row for row in rows if row[0] in args.kinds]
                 for kind, name, options in rows:
-                    summary, _ = compress(args.program, model, output, "--ratio", kept, *options)
+                    output = archive if name == ARCHIVE else small
+                    summary, _ = compress(args.program, model, output, "--ratio", kept, "--cache", cache, *options)
                     quality = evaluate(args.program, model, output)
                     results.add(
                         model=model.name, kept=kept, kind=kind, setting=name, gaussians=summary["gaussians"],
                         bytes=summary["output_bytes"], psnr_db=quality["psnr"], ssim=quality["ssim"],
                     )  # fmt: skip
+            shutil.rmtree(cache)
 
 
 if __name__ == "__main__":

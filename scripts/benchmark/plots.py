@@ -140,7 +140,8 @@ def ablation():
 
 def shown_in_ablation(row):
     """Returns whether a row adds or removes a stage that changes which Gaussians stay or their values."""
-    return row["kind"] == "stage" and row["setting"] not in ("default, exact field", "default, every SH degree")
+    same_values = ("default, exact field", "default, every SH degree", "default, as archive")
+    return row["kind"] == "stage" and row["setting"] not in same_values
 
 
 def main():

@@ -29,7 +29,7 @@ use crate::outputs::kind::OutputKind;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::prune_steps::PrunedModels;
-use crate::refinement::targets::{Targets, ViewSplit};
+use crate::refinement::targets::{TargetViewParams, Targets, ViewSplit};
 use crate::refinement::{RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
@@ -72,9 +72,9 @@ pub struct SearchStage {
     /// Quality that the search must reach. For an archive it is higher than requested, because quantization costs
     /// quality.
     searched: Quality,
-    /// Number of target views (renders of the original model). Refinement fits models to some of them; the quality of
-    /// the models is measured on others.
-    target_views: usize,
+    /// Number and kinds of target views (renders of the original model). Refinement fits models to some of them; the
+    /// quality of the models is measured on others.
+    target_views: TargetViewParams,
     /// Refinement stage, which is run at every size; `None` if nothing is refined.
     refine: Option<RefineStage>,
     /// Whether every tried model is also fitted to photographs, those in the folder of [`Quality::Loss`].
@@ -108,7 +108,7 @@ impl SearchStage {
         Some(SearchStage {
             quality: quality.clone(),
             searched,
-            target_views: request.recipe.refine.refine_target_views,
+            target_views: TargetViewParams::from_recipe(&request.recipe.refine),
             refine: planning.refine.clone(),
             fits_photographs: request.photographs.is_some(),
             margins: [field, bands],
@@ -133,7 +133,7 @@ impl SearchStage {
             stage: NAME,
             reads: work.scattered_whole_input_reads(frames, limits),
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64)
-                + work.render_seconds(self.target_views as f64, work.gaussian_count(), RENDER_COST),
+                + work.render_seconds(self.target_views.max_count as f64, work.gaussian_count(), RENDER_COST),
             per_gaussian: [
                 scored_memory(limits),
                 vec![

@@ -175,6 +175,8 @@ pub struct RefineParams {
     pub refine_steps: u32,
     pub refine_steps_per_prune: u32,
     pub refine_target_views: usize,
+    pub refine_between: bool,
+    pub refine_validate: bool,
     pub refine_ssim: f64,
     pub refine_keyframes: usize,
     pub refine_archive_steps: u32,

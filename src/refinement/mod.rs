@@ -44,6 +44,7 @@ use crate::recipe;
 use crate::refinement::optimizer_state::{REEVALUATE_EVERY, StepParams, keyframe_count};
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES, STRIP_BYTES};
 use loss::Loss;
+use targets::TargetViewParams;
 
 /// Name of the refinement stage in messages and in the cache.
 const NAME: &str = "refine";
@@ -86,8 +87,11 @@ pub struct RefineStage {
     /// Upper limit of the number of optimization steps before a prune step. [`RefineStage::steps_before`] returns a
     /// smaller number while many Gaussians are left.
     pub steps_per_prune: usize,
-    /// Maximum number of target views (renders of the original that the Gaussians are fitted to).
-    pub target_views: usize,
+    /// Number and kinds of target views (renders of the original that the Gaussians are fitted to).
+    pub target_views: TargetViewParams,
+    /// Whether validation views choose among the parameters that the final steps pass through. Otherwise those after
+    /// the last step are kept.
+    pub validates: bool,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub prunes: bool,
     /// Constant c of the removal errors by which Gaussians are ranked for a prune step: c² is added to each squared
@@ -115,7 +119,9 @@ impl RefineStage {
             refine,
             refine_steps,
             refine_steps_per_prune,
-            refine_target_views,
+            refine_target_views: _,
+            refine_between: _,
+            refine_validate,
             refine_ssim,
             refine_keyframes,
             refine_archive_steps,
@@ -126,7 +132,8 @@ impl RefineStage {
             loss: Loss { ssim: refine_ssim },
             steps: refine_steps as usize,
             steps_per_prune: refine_steps_per_prune as usize,
-            target_views: refine_target_views,
+            target_views: TargetViewParams::from_recipe(&recipe.refine),
+            validates: refine_validate,
             prunes,
             contrast_floor: recipe.select.contrast_floor,
             keyframes: refine_keyframes,
@@ -162,8 +169,9 @@ impl RefineStage {
 
     /// Returns the cache key of the parameters of this stage. It does not depend on the input.
     pub(crate) fn key(&self) -> CacheKey {
-        let step_settings = (self.steps, self.steps_per_prune, self.target_views, self.prunes, self.keyframes);
-        CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, step_settings))
+        let step_settings = (self.steps, self.steps_per_prune, self.prunes, self.keyframes);
+        let view_settings = (self.target_views, self.validates, self.contrast_floor);
+        CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, step_settings, view_settings))
     }
 
     fn step_params(&self) -> StepParams {
@@ -226,7 +234,7 @@ impl RefineStage {
     /// Returns the resource estimate (bytes of memory, seconds) of refinement for the input `work`. The memory holds
     /// frame states, the optimizer, and one render with its gradient.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        self.estimate_for_views(work, limits, targets::view_counts(self.target_views, work.pixels))
+        self.estimate_for_views(work, limits, self.target_views.view_counts(work.pixels))
     }
 
     /// Estimates memory and time as [`RefineStage::resource_estimate`] does, for `own` target views from the scene's
@@ -280,7 +288,8 @@ impl RefineStage {
         let prune_counts =
             prune_counts(self.initial_count((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted) + if keyframe_count > 0 { along_time(self.last_steps(wanted)) } else { 0 };
-        let validation_renders = target_views / targets::validation_every(own + between) as f64 * 4.0;
+        let validations = if self.validates { 4.0 } else { 2.0 };
+        let validation_renders = target_views / targets::validation_every(own + between) as f64 * validations;
         let seconds = |(k, &size): (usize, &usize)| {
             let (count, left) = (size as f64 / 1e6 * work.gaussian_count(), (wanted * 1e6) as usize);
             let (steps, renders, ranked) = match k + 1 == prune_counts.len() {

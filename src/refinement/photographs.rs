@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use super::run::RefineRun;
-use super::targets::{Targets, photograph_counts};
+use super::targets::Targets;
 use super::{NO_GAIN, RefineStage};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -46,13 +46,13 @@ impl RefineStage {
             return Err(Error::input(folder, "", expected, format!("{} of them", found.len())));
         }
         let schedule = ViewSchedule::from_views(scene.schedule.cameras.clone(), &found);
-        let [count, _] = photograph_counts(self.target_views, scene.workload().pixels);
+        let [count, _] = self.target_views.photograph_counts(scene.workload().pixels);
         Ok((select_evenly(&schedule, count, VIEWS_PER_FRAME), photographs))
     }
 
     /// Estimates the memory and time of the fit to photographs for the input `work`.
     pub(crate) fn photographs_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let mut need = self.estimate_for_views(work, limits, photograph_counts(self.target_views, work.pixels));
+        let mut need = self.estimate_for_views(work, limits, self.target_views.photograph_counts(work.pixels));
         need.stage = NAME;
         need.fixed.push(("photographs", work.threads * DECODE_BYTES_PER_PIXEL * work.pixels));
         need
@@ -85,7 +85,7 @@ impl RefineStage {
         let key = scene.work.key(&key);
         journal.run_cached_stage(NAME, count, scene, key, |journal| {
             let stride = self.stride(scene.workload().pixels, count);
-            let targets = Targets::with_photographs(scene, stride, (seen, photographs))?;
+            let targets = Targets::with_photographs(scene, self.target_views, stride, (seen, photographs))?;
             let parts = targets.split();
             let held_back = parts.validation.len();
             // The notes of a refinement are about renders of the original, so they are not taken over.

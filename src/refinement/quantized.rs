@@ -76,12 +76,12 @@ mod tests {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         let mut stage = RefineStage::from_recipe(&recipe, None, false).unwrap();
-        (stage.steps, stage.target_views, stage.keyframes) = (60, 60, 0);
+        (stage.steps, stage.target_views.max_count, stage.keyframes) = (60, 60, 0);
         let kept = scored.ranking().best_ids(300);
         let fixed: Vec<bool> = kept.iter().map(|id| id % 7 == 0).collect();
         let compressed = crate::compressed_model::CompressedModel::pruned(kept, &recipe.merge);
         let result = scene.input.compressed_frames(&compressed).unwrap();
-        let targets = Targets::new(&scene, 60, std::num::NonZeroU32::MIN, false).unwrap();
+        let targets = Targets::new(&scene, stage.target_views, std::num::NonZeroU32::MIN, false).unwrap();
         let start = crate::passes::gather_all(&*result, 0, Attributes::all()).unwrap();
         // Log scales, opacities and colors in steps of 1/2, positions and rotations in steps of 2^-10.
         let steps = [-80, -80, -8, -8, -8, -8, -8, -8];

@@ -466,13 +466,13 @@ impl<'a> RefineRun<'a> {
             if is_averaged(step, steps) {
                 best_state.mean.add(optimizer.change());
             }
-            if step % validate_every == 0 || step == steps {
+            if self.refine.validates && step % validate_every == 0 || step == steps {
                 match step == steps && best_state.mean.count > 0 {
                     true => optimizer.restart_from(&best_state.mean.delta)?,
                     false => optimizer.reevaluate_states()?,
                 }
                 let now = optimizer.quality(&self.validation)?;
-                if self.refine.loss.is_closer(&now, &best_state.best) {
+                if self.keeps(&now, &best_state.best) {
                     (best_state.best, best_state.delta) = (now, optimizer.change());
                 } else if step < steps {
                     best_state.mean = MeanDelta::default();
@@ -487,7 +487,7 @@ impl<'a> RefineRun<'a> {
         }
         let is_along = self.refine_along_time(optimizer, timer, (done, schedule), &mut best_state, steps)?;
         let [start, best] = [best_state.before.psnr, best_state.best.psnr];
-        if self.refine.loss.is_closer(&best_state.best, &best_state.before) {
+        if self.keeps(&best_state.best, &best_state.before) {
             journal.notes.push(format!("refinement: validation PSNR {start:.2} → {best:.2} dB ({count} views)"));
             journal.refined = Some(RefinedSummary { views: count, before: start, result: best });
         } else {
@@ -502,6 +502,12 @@ impl<'a> RefineRun<'a> {
             journal.leave_out("changes along time", why);
         }
         Ok(best_state)
+    }
+
+    /// Returns whether the current parameters, of validation quality `now`, replace the best parameters so far, of
+    /// quality `best`. Without validation ([`RefineStage::validates`]) they always do, unless a render is not a number.
+    fn keeps(&self, now: &RenderQuality, best: &RenderQuality) -> bool {
+        self.refine.loss.is_closer(now, best) || !self.refine.validates && !now.psnr.is_nan()
     }
 
     /// Runs the optimization steps of the time-varying delta (values added to each frame), and stores the best deltas
@@ -537,10 +543,10 @@ impl<'a> RefineRun<'a> {
         for step in done.saturating_sub(steps) + 1..=keyframe_steps {
             optimizer.step_trajectory(self.sampler.next(), &schedule)?;
             self.progress.advance(1);
-            if step % validate_every == 0 || step == keyframe_steps {
+            if self.refine.validates && step % validate_every == 0 || step == keyframe_steps {
                 let now = optimizer.quality(&self.validation)?;
                 let gains = self.refine.loss.ssim > 0.0 || now.psnr >= best_state.best.psnr + MIN_KEYFRAME_GAIN;
-                if gains && self.refine.loss.is_closer(&now, &best_state.best) {
+                if (gains || !self.refine.validates) && self.keeps(&now, &best_state.best) {
                     (best_state.best, best_state.trajectory) = (now, optimizer.trajectory_delta());
                 }
             }

@@ -5,11 +5,13 @@ use std::ops::Range;
 
 use hashbrown::HashSet;
 use rayon::prelude::*;
+use serde::Serialize;
 
 use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, FrameView, hash_id};
 use crate::passes::{BatchLimits, RenderableView, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly};
+use crate::recipe::RefineParams;
 use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
@@ -62,20 +64,40 @@ pub(crate) struct ViewSplit {
     pub(crate) test: Vec<usize>,
 }
 
-/// Returns two numbers of target views: the number from the scene's cameras, and the number from new cameras. Their sum
-/// is at most `max_views`, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
-pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
-    let count = total_count(max_views, pixels);
-    let own = fraction(SCENE_VIEW_PART, count).min(MAX_SCENE_VIEWS);
-    [own, count - own]
+/// Parameters by which target views are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct TargetViewParams {
+    /// Maximum number of target views.
+    pub max_count: usize,
+    /// Whether some target views are from new cameras: between the scene's cameras, or outside the rig.
+    pub between: bool,
 }
 
-/// Returns two numbers of target views if some of them show photographs: the number of photographs, and the number of
-/// renders from new cameras. Their sum is at most `max_views`, and smaller if so many views of `pixels` pixels would
-/// exceed [`MAX_BYTES`].
-pub(super) fn photograph_counts(max_views: usize, pixels: u64) -> [usize; 2] {
-    let photographs = fraction(PHOTOGRAPH_PART, total_count(max_views, pixels)).min(MAX_PHOTOGRAPHS);
-    [photographs, fraction(RENDERS_PER_PHOTOGRAPH, photographs)]
+impl TargetViewParams {
+    pub(crate) fn from_recipe(params: &RefineParams) -> TargetViewParams {
+        TargetViewParams { max_count: params.refine_target_views, between: params.refine_between }
+    }
+
+    /// Returns two numbers of target views: the number from the scene's cameras, and the number from new cameras. Their
+    /// sum is at most the maximum, and smaller if so many views of `pixels` pixels would exceed [`MAX_BYTES`].
+    pub(super) fn view_counts(self, pixels: u64) -> [usize; 2] {
+        let count = total_count(self.max_count, pixels);
+        let own = if self.between { fraction(SCENE_VIEW_PART, count).min(MAX_SCENE_VIEWS) } else { count };
+        [own, count - own]
+    }
+
+    /// Returns two numbers of target views if some of them show photographs: the number of photographs, and the number
+    /// of renders from new cameras. Their sum is at most the maximum, and smaller if so many views of `pixels` pixels
+    /// would exceed [`MAX_BYTES`].
+    pub(super) fn photograph_counts(self, pixels: u64) -> [usize; 2] {
+        let photographs = fraction(PHOTOGRAPH_PART, total_count(self.max_count, pixels)).min(MAX_PHOTOGRAPHS);
+        [photographs, self.renders_beside(photographs)]
+    }
+
+    /// Returns the number of renders from new cameras that target views have beside `photographs` photographs.
+    fn renders_beside(self, photographs: usize) -> usize {
+        if self.between { fraction(RENDERS_PER_PHOTOGRAPH, photographs) } else { 0 }
+    }
 }
 
 /// Returns the number of target views of `pixels` pixels each: as many as fit into [`MAX_BYTES`], but at least
@@ -131,14 +153,19 @@ enum Purpose {
 }
 
 impl Targets {
-    /// Renders at most `max_views` views of the original, fewer if they would exceed [`MAX_BYTES`], and stores them in
-    /// a scratch file. Returns these target views. Of training views only every `stride`-th column and row of pixels is
+    /// Renders the views of the original that `params` asks for, fewer if they would exceed [`MAX_BYTES`], and stores
+    /// them in a scratch file. Returns these target views. Of training views only every `stride`-th column and row of pixels is
     /// rendered. If `has_test_views`, every fourth view is a test view; otherwise there are no test views.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.
-    pub(crate) fn new(scene: &Scene, max_views: usize, stride: NonZeroU32, has_test_views: bool) -> Result<Targets> {
-        let [scene_views, new_views] = view_counts(max_views, scene.workload().pixels);
+    pub(crate) fn new(
+        scene: &Scene,
+        params: TargetViewParams,
+        stride: NonZeroU32,
+        has_test_views: bool,
+    ) -> Result<Targets> {
+        let [scene_views, new_views] = params.view_counts(scene.workload().pixels);
         let seen = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
         let (cameras, views, guard_cameras) = add_new_views(scene, seen, new_views);
         let purpose = |k: usize| match guard_cameras.contains(&views[k].camera) {
@@ -153,8 +180,8 @@ impl Targets {
 
     /// Creates target views of two kinds and stores their pixels in a scratch file:
     /// - the views `seen` from the scene's cameras, which show photographs of the scene;
-    /// - new cameras, which show renders of the original and keep the result from overfitting the photographs. Their
-    ///   number is in a fixed ratio to the number of photographs.
+    /// - new cameras, if `params` asks for them, which show renders of the original and keep the result from
+    ///   overfitting the photographs. Their number is in a fixed ratio to the number of photographs.
     ///
     /// The photographs of one in eight cameras are validation views. If fewer than eight cameras have photographs, one
     /// in eight photographs is a validation view. All other views are training views; of these only every `stride`-th
@@ -164,10 +191,11 @@ impl Targets {
     /// Fails if a frame or a photograph cannot be read, or if the scratch file cannot be written.
     pub(crate) fn with_photographs(
         scene: &Scene,
+        params: TargetViewParams,
         stride: NonZeroU32,
         (seen, photographs): (Vec<FrameView>, &Photographs),
     ) -> Result<Targets> {
-        let new_views = fraction(RENDERS_PER_PHOTOGRAPH, seen.len());
+        let new_views = params.renders_beside(seen.len());
         // Index in the schedule of each of the cameras that `add_new_views` lists first.
         let used = scene.schedule.used_cameras();
         let mut cameras_with_photographs: Vec<u32> = seen.iter().map(|view| view.camera).collect();
@@ -399,6 +427,10 @@ pub(super) fn wide(value: u16) -> f32 {
 mod tests {
     use super::*;
 
+    fn views(max_count: usize) -> TargetViewParams {
+        TargetViewParams { max_count, between: true }
+    }
+
     #[test]
     fn sixteen_bits_are_accurate_to_1e_5() {
         let image = Image { width: 1, height: 1, data: vec![0.0, 1.0, 0.123_456] };
@@ -428,13 +460,15 @@ mod tests {
 
     #[test]
     fn large_views_are_fewer_but_never_too_few() {
-        assert_eq!(view_counts(1000, 320 * 256), [60, 940]);
-        assert_eq!(view_counts(520, 0), [60, 460]);
-        assert_eq!(view_counts(1000, 1352 * 1014), [15, 115]);
-        assert_eq!(view_counts(1000, 1 << 40), [11, 85]);
-        assert_eq!(view_counts(40, 1 << 40), [4, 36]);
-        assert_eq!(photograph_counts(1000, 320 * 256), [400, 120]);
-        assert_eq!(photograph_counts(1000, 1352 * 1014), [100, 30]);
+        assert_eq!(views(1000).view_counts(320 * 256), [60, 940]);
+        assert_eq!(views(520).view_counts(0), [60, 460]);
+        assert_eq!(views(1000).view_counts(1352 * 1014), [15, 115]);
+        assert_eq!(views(1000).view_counts(1 << 40), [11, 85]);
+        assert_eq!(views(40).view_counts(1 << 40), [4, 36]);
+        let own = TargetViewParams { between: false, ..views(520) };
+        assert_eq!((own.view_counts(0), own.photograph_counts(0)), ([520, 0], [400, 0]));
+        assert_eq!(views(1000).photograph_counts(320 * 256), [400, 120]);
+        assert_eq!(views(1000).photograph_counts(1352 * 1014), [100, 30]);
     }
 
     #[test]

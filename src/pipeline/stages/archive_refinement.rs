@@ -62,7 +62,7 @@ impl RefineStage {
         let mut refine = self.clone().without_prune_steps().with_time_independent_deltas();
         refine.steps = self.archive_steps;
         if !searches {
-            refine.target_views = refine.target_views.min(MAX_TARGET_VIEWS);
+            refine.target_views.max_count = refine.target_views.max_count.min(MAX_TARGET_VIEWS);
         }
         (refine.steps > 0).then_some(refine)
     }

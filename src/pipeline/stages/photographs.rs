@@ -46,7 +46,8 @@ impl Stage for PhotographStage {
 
     fn parameters(&self) -> String {
         let RefineStage { steps, target_views, .. } = self.refine;
-        format!("photographs: {steps} steps toward {target_views} views, of which about three quarters are photographs")
+        let views = target_views.max_count;
+        format!("photographs: {steps} steps toward {views} views, of which about three quarters are photographs")
     }
 
     fn check(&self, scene: &Scene) -> Result<()> {

@@ -28,7 +28,8 @@ impl Stage for RefineStage {
 
     fn parameters(&self) -> String {
         let RefineStage { steps, steps_per_prune, target_views, .. } = self;
-        format!("refine: {steps} steps at the end, {steps_per_prune} before a prune step, toward {target_views} views")
+        let views = target_views.max_count;
+        format!("refine: {steps} steps at the end, {steps_per_prune} before a prune step, toward {views} views")
     }
 
     /// Returns whether refinement may be unnecessary: the run removes so few Gaussians that the PSNR of renders against
