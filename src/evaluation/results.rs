@@ -261,6 +261,11 @@ impl Evaluation {
         self
     }
 
+    /// Returns the render with the lowest PSNR against the original; `None` if there are no views.
+    pub fn worst_render(&self) -> Option<&ViewQuality> {
+        self.views.iter().min_by(|a, b| a.loss.psnr.total_cmp(&b.loss.psnr))
+    }
+
     /// Returns the evaluation as text for the terminal: both models, a table of mean quality measures, the worst view
     /// and the worst frame, and the notes.
     pub fn text(&self) -> String {

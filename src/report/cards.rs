@@ -134,7 +134,7 @@ fn table(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].data.evaluation;
     let has_photographs = results.iter().all(|result| result.data.evaluation.ground_truth.is_some());
     let has_times = results.iter().all(|result| result.data.render_time.is_some());
-    let mut heads = vec!["Model", "Gaussians", "Size", "PSNR", "SSIM", "Worst view"];
+    let mut heads = vec!["Model", "Gaussians", "Size", "PSNR", "SSIM", "Worst render"];
     heads.extend(has_photographs.then_some("Photographs"));
     heads.extend(has_times.then_some("Render time"));
     let mut rows = vec![vec![
@@ -152,7 +152,7 @@ fn table(results: &[Analysis], names: &[String]) -> String {
     for (result, name) in results.iter().zip(names) {
         let found = &result.data.evaluation;
         let share = |part: f64, whole: f64| format!("<small>{}</small>", percent(part, whole));
-        let worst = found.loss.per_view.iter().map(|view| view.means.psnr).fold(f64::INFINITY, f64::min);
+        let worst = found.worst_render().map_or(f64::NAN, |render| render.loss.psnr);
         let mut row = vec![
             escape(name),
             count(found.count.compressed) + &share(found.count.compressed as f64, found.count.original as f64),

@@ -31,7 +31,12 @@ pub(super) fn details(
     };
     let numbers = each(&|result, name| numbers(&result.data, name)) + &quality::other_charts(results, names);
     let sections = [
-        ("numbers", "All figures", "Every measure: on average, and in the worst frame and view.", numbers),
+        (
+            "numbers",
+            "All figures",
+            "Every measure: means of all renders, of the worst frame and of the worst view.",
+            numbers,
+        ),
         (
             "renders",
             "More renders",
@@ -97,7 +102,7 @@ fn numbers(result: &CompressedModelData, name: &str) -> String {
     let found = &result.evaluation;
     let mut out = format!(
         "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"Measures of {}\"><table class=\"wide\">\n\
-         <tr><th>measure</th><th>average</th><th>worst frame</th><th>worst view</th></tr>\n",
+         <tr><th>measure</th><th>average</th><th>worst frame (mean)</th><th>worst view (mean)</th></tr>\n",
         escape(name)
     );
     out += &measures("compressed to original", &found.loss);

@@ -31,8 +31,7 @@ pub(super) fn verdict(evaluation: &Evaluation, modes: &[FailureMode]) -> String 
         mean.pairs,
         if mean.pairs == 1 { "" } else { "s" },
     );
-    let worst = evaluation.views.iter().min_by(|a, b| a.loss.psnr.total_cmp(&b.loss.psnr));
-    if let Some(worst) = worst.filter(|_| mean.pairs > 1) {
+    if let Some(worst) = evaluation.worst_render().filter(|_| mean.pairs > 1) {
         text += &format!(", {:.1} dB in the worst, frame {} of view {}", worst.loss.psnr, worst.frame, worst.view);
     }
     text += ").";
