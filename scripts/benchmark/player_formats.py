@@ -4,8 +4,9 @@
     cargo build --release
     python3 scripts/benchmark/player_formats.py target/release/splatsieve DATA [--models A,B] [--kept 10%] [--fourdgs PYTHON]
 
-Every model is compressed to a tenth first. Then `convert` writes that result in each format: bytes of the file or
-folder, processor seconds, and PSNR of the file as this program reads it, on the test views against renders of the
+Every model is compressed to a tenth first. Then `convert` writes that result in each format, and `compress` writes a
+`.splatv` directly, for which it refines colors without direction (not of a `.splatv`, which has no others): bytes of the
+file or folder, processor seconds, and PSNR of the file as this program reads it, on the test views against renders of the
 original model. A `.4dgs` is read by the package fourdgs of PYTHON (fourdgs_frames.py); nothing here reads a `.gsd`.
 The frames are those of the cameras' times, 30 for the captured scene. Folders of `.spz` files are made frame by frame.
 """
@@ -16,12 +17,15 @@ from pathlib import Path
 
 from measuring import Results, arguments, chosen, compress, evaluate, run
 
+# Row of the `.splatv` that `compress` writes.
+DIRECT = ".splatv of compress"
 # Name of the format in the table, name of the output, options of `convert`.
 FORMATS = [
     ("model", None, []),
     (".gsz", "small.gsz", []),
     (".gseq", "small.gseq", []),
     (".splatv", "out.splatv", []),
+    (DIRECT, "direct.splatv", []),
     (".tsog", "out.tsog", []),
     (".ftgs.ply", "out.ftgs.ply", []),
     (".sog frames", "sog", ["--as", "sog-sequence"]),
@@ -61,7 +65,11 @@ def main():
             for name, file, options in FORMATS:
                 output, reader, quality = small if file is None else folder / file, "splatsieve", None
                 seconds = whole.processor
-                if name == ".spz frames":
+                if name == DIRECT and model.suffix == ".splatv":
+                    continue
+                if name == DIRECT:
+                    seconds = compress(args.program, model, output, "--ratio", args.kept)[1].processor
+                elif name == ".spz frames":
                     seconds = spz_frames(args.program, model, small, output, folder)
                 elif name != "model":
                     command = [args.program, "convert", small, output, "--cameras", model.cameras, *model.options, *options]

@@ -139,9 +139,9 @@ def ablation():
 
 
 def shown_in_ablation(row):
-    """Returns whether a row adds or removes a stage that changes which Gaussians stay or their values."""
-    same_values = ("default, exact field", "default, every SH degree", "default, as archive")
-    return row["kind"] == "stage" and row["setting"] not in same_values
+    """Returns whether a row is a stage whose curve can be told apart from the others."""
+    like_default = ("exact field", "every SH degree", "as archive", "rounds of 48 views", "no views outside the rig", "without validation")
+    return row["kind"] == "stage" and row["setting"] not in [f"default, {name}" for name in like_default]
 
 
 def main():

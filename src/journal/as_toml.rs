@@ -58,7 +58,15 @@ mod tests {
                 measured: vec![("a.b \"c\"".to_owned(), odd, 1.0, odd)],
             });
             let (name, held_views) = ("min_psnr".to_owned(), vec!["t000_between".to_owned()]);
-            same(&GoalSummary { name, asked: 30.0, searched: odd, held: odd, held_views, tried: tried.clone() });
+            same(&GoalSummary {
+                name,
+                asked: 30.0,
+                before_conversion: true,
+                searched: odd,
+                held: odd,
+                held_views,
+                tried: tried.clone(),
+            });
             let mut journal = Journal::default();
             journal.leave_out("a", "b");
             journal.leave_out_with_saving("c", "d", SavedCost::Stage { seconds: odd, reads: 2.0 });

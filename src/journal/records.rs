@@ -198,6 +198,10 @@ pub struct QualitySummary {
     /// is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ssim: Option<f64>,
+    /// Whether the quality is that of the result before it was converted to the format of the output, which this program
+    /// writes but does not read. The output itself is a little worse.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub before_conversion: bool,
     /// Render times of the original and the result, if measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub render_ms: Option<RenderTime>,

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, ShowPath};
 use crate::files::names::has_ending;
+use crate::model::NO_SH_LIMIT;
 
 /// Kind of output: the file format, or the layout of the output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -45,6 +46,17 @@ pub enum OutputKind {
     /// A `.tsog` file for web players, with attributes as images: Gaussians with linear motion, whose opacity follows a
     /// Gaussian function of time, or single frames.
     Tsog,
+}
+
+/// Relation of the renders of an output file to those of the result that is stored in it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fidelity {
+    /// The file stores the values themselves, so its renders are the same.
+    Exact,
+    /// The file stores rounded values or fitted motion. Its quality is measured by reading it.
+    Approximate,
+    /// The file stores rounded values or fitted motion, and this program does not read files of this kind.
+    Unreadable,
 }
 
 impl OutputKind {
@@ -117,6 +129,35 @@ impl OutputKind {
     /// fitted to them. The kinds `Model`, `Ply` and `Archive` are made from the stored parameters of a model instead.
     pub fn stores_frames(self) -> bool {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
+    }
+
+    /// Returns the highest SH degree that this kind of output stores, whatever the input has.
+    pub fn max_sh_degree(self) -> usize {
+        match self {
+            OutputKind::Splatv | OutputKind::Gsd => 0,
+            _ => NO_SH_LIMIT,
+        }
+    }
+
+    /// Returns how renders of a file of this kind differ from those of the result that is stored in it. Archives are
+    /// not considered: a stage of their own chooses their precision and measures it.
+    pub fn fidelity(self) -> Fidelity {
+        match self {
+            OutputKind::FourDgs | OutputKind::Gsd => Fidelity::Unreadable,
+            OutputKind::Splatv
+            | OutputKind::Spz
+            | OutputKind::Spz4
+            | OutputKind::Sog
+            | OutputKind::SogSequence
+            | OutputKind::Ftgs
+            | OutputKind::Tsog => Fidelity::Approximate,
+            OutputKind::Model
+            | OutputKind::Gseq
+            | OutputKind::PlySequence
+            | OutputKind::Ply
+            | OutputKind::Archive
+            | OutputKind::Glb => Fidelity::Exact,
+        }
     }
 
     /// Returns the number of bytes of memory per Gaussian that encoding one frame takes, besides the frame itself.

@@ -147,10 +147,16 @@ fn run_stages(
         scene.events.begin_run(&stage_seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
     let input = InputSummary::from_scene(scene)?.without_folder_paths();
     let recipe = recipe_text(&input.digest, plan, request, &mut journal);
-    let sh_degree = match request.recipe.bands.bands {
-        ShDegreeRule::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),
+    let requested_degree = match request.recipe.bands.bands {
+        ShDegreeRule::UpTo(degree) => degree,
         ShDegreeRule::All | ShDegreeRule::Needed => NO_SH_LIMIT,
     };
+    let stored_degree = plan.output.as_ref().map_or(NO_SH_LIMIT, |output| output.kind.max_sh_degree());
+    let (degree, reason) = match stored_degree < requested_degree {
+        true => (stored_degree, "because the format of the output stores none"),
+        false => (requested_degree, "as requested"),
+    };
+    let sh_degree = stages::bands::highest(scene, degree, reason, &mut journal);
     let template = CompressedModel { sh_degree, ..CompressedModel::pruned(Vec::new(), &request.recipe.merge) };
     let mut run = RunState::new(scene, request, &plan.stages, template);
     (run.journal, run.input, run.recipe) = (journal, Some(input), recipe);

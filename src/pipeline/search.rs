@@ -25,7 +25,7 @@ use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN};
 use crate::model::{Attributes, FrameView};
-use crate::outputs::kind::OutputKind;
+use crate::outputs::kind::{Fidelity, OutputKind};
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::prune_steps::PrunedModels;
@@ -72,6 +72,8 @@ pub struct SearchStage {
     /// Quality that the search must reach. For an archive it is higher than requested, because quantization costs
     /// quality.
     searched: Quality,
+    /// Whether the output stores the result only approximately, which the search does not take into account.
+    before_conversion: bool,
     /// Number and kinds of target views (renders of the original model). Refinement fits models to some of them; the
     /// quality of the models is measured on others.
     target_views: TargetViewParams,
@@ -108,6 +110,7 @@ impl SearchStage {
         Some(SearchStage {
             quality: quality.clone(),
             searched,
+            before_conversion: output.fidelity() != Fidelity::Exact,
             target_views: TargetViewParams::from_recipe(&request.recipe.refine),
             refine: planning.refine.clone(),
             fits_photographs: request.photographs.is_some(),
@@ -400,15 +403,16 @@ impl SearchStage {
     }
 
     fn summary(&self, best: &TriedSize, held: f64, held_views: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
-        let asked = self.goal();
-        GoalSummary { name: self.name().to_owned(), asked, searched: best.value, held, held_views, tried }
+        let (name, asked, before_conversion) = (self.name().to_owned(), self.goal(), self.before_conversion);
+        GoalSummary { name, asked, before_conversion, searched: best.value, held, held_views, tried }
     }
 }
 
 /// Returns a note for display about the result of the search. `searched`: number of views that the search used.
 /// `gaussians`: number of Gaussians in the result. `is_met`: whether the result has the requested quality.
 fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) -> String {
-    let GoalSummary { name, asked, searched: by_searched, held, held_views, tried } = summary;
+    let GoalSummary { name, asked, searched: by_searched, held, held_views, tried, before_conversion } = summary;
+    let stage = if *before_conversion { ", before conversion to the format of the output" } else { "" };
     let (sizes, others) = (tried.len(), held_views.len());
     let (at, unit) = if name == "max_loss" { ("most", "dB loss against photographs") } else { ("least", "dB PSNR") };
     let found = match is_met {
@@ -417,6 +421,6 @@ fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) 
     };
     format!(
         "search for at {at} {asked} {unit}: {found}; {by_searched:.2} dB on the {searched} views of the search, \
-         {held:.2} dB on {others} other views (goal.held_views in the summary)"
+         {held:.2} dB on {others} other views{stage} (goal.held_views in the summary)"
     )
 }

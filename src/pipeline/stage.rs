@@ -4,6 +4,7 @@
 //! the plan of a run. The list `STAGES` in that module holds these functions in the order in which stages run.
 
 use std::fmt::Debug;
+use std::path::Path;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -81,6 +82,20 @@ pub trait Stage: Debug + Send + Sync {
     /// without enough memory for the stage omits it.
     fn is_optional(&self) -> bool {
         false
+    }
+
+    /// Measures the quality of the output of `_run` by reading it from `_path`, where it is written before it gets its
+    /// final name. The time of the measurement is added to `_journal`. Returns `None` if the stage does not measure this.
+    ///
+    /// # Errors
+    /// Fails if the output or the input cannot be read.
+    fn measure_output(
+        &self,
+        _run: &RunState<'_>,
+        _path: &Path,
+        _journal: &mut Journal,
+    ) -> Result<Option<QualitySummary>> {
+        Ok(None)
     }
 
     /// Returns the work of the stage that several processes can divide among themselves, as lines of text: one line per

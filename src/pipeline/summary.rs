@@ -31,6 +31,10 @@ pub struct GoalSummary {
     pub name: String,
     /// Requested value, dB: minimum PSNR against the original, or maximum loss of PSNR against photographs.
     pub asked: f64,
+    /// Whether the quality is that of the result before it was converted to the format of the output, which stores
+    /// rounded values or fitted motion.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub before_conversion: bool,
     /// Quality of the output on the views that the search used, dB: PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "number")]
     pub searched: f64,

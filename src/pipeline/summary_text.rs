@@ -115,9 +115,10 @@ impl Summary {
         if let Some(goal) = &self.goal {
             let of = if goal.name == "max_loss" { "loss against photographs" } else { "PSNR vs. original" };
             let views = goal.held_views.len();
+            let stage = if goal.before_conversion { ", before conversion" } else { "" };
             writeln!(
                 out,
-                "{:<14}  {} dB {of} asked for, {:.2} dB on {} apart from the search",
+                "{:<14}  {} dB {of} asked for, {:.2} dB on {} apart from the search{stage}",
                 "Target",
                 goal.asked,
                 goal.held,
@@ -164,7 +165,7 @@ impl Summary {
 
     /// Returns the quality of the result as text: how close its renders are to those of the original.
     fn quality_text(&self) -> String {
-        let Some(QualitySummary { kind, views, psnr, ssim, .. }) = self.quality else {
+        let Some(QualitySummary { kind, views, psnr, ssim, before_conversion, .. }) = self.quality else {
             return "not measured; `splatsieve evaluate` measures it".to_owned();
         };
         let views = match kind {
@@ -173,6 +174,7 @@ impl Summary {
             ViewKind::Training => counted(views, "training view"),
             ViewKind::Virtual => counted(views, "virtual view"),
         };
+        let views = if before_conversion { views + ", before conversion" } else { views };
         if psnr >= PSNR_CAP_DB {
             return format!("no difference from the original ({views})");
         }

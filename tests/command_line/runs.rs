@@ -175,7 +175,7 @@ fn default_run_reads_a_container_at_most_2_5_times() {
 #[test]
 fn reported_quality_equals_evaluate_on_the_same_views() {
     let workplace = Workplace::new();
-    for output in ["out", "out.gsz"] {
+    for output in ["out", "out.gsz", "out.splatv", "out.ftgs.ply", "out.tsog"] {
         let summary =
             workplace.summary(&format!("{{tiny}} --cameras {{tiny}} --ratio 0.4 --set refine_steps=40 -o {output}"));
         let quality = &summary["quality"];

@@ -152,6 +152,26 @@ fn frames_and_single_files_lower_the_sh_degree_too() {
 }
 
 #[test]
+fn colors_of_a_format_without_higher_degrees_are_refined_for_it() {
+    let workplace = Workplace::new();
+    write_faint_above(&workplace, 3);
+    let how = "--cameras {tiny} --ratio 0.5 --set refine_steps=300 --set refine_target_views=60 --set bands=all";
+    workplace.done(&format!("compress model {how} -o whole"));
+    workplace.done("convert whole late.splatv --cameras {tiny}");
+    let summary = workplace.summary(&format!("model {how} -o direct.splatv"));
+    let notes = summary["notes"].as_array().unwrap();
+    assert!(
+        notes.iter().any(|note| note.as_str().unwrap().contains("the format of the output stores none")),
+        "{notes:?}"
+    );
+    let [late, direct] = ["late.splatv", "direct.splatv"].map(|result| {
+        let found = workplace.done(&format!("evaluate model {result} --cameras {{tiny}} --json"));
+        serde_json::from_str::<Value>(&found).unwrap()["psnr"].as_f64().unwrap()
+    });
+    assert!(direct > late, "{direct} dB, {late} dB if converted afterwards");
+}
+
+#[test]
 #[ignore = "needs Python"]
 fn lower_degree_passes_the_loader_check_and_a_wrong_one_fails() {
     let workplace = Workplace::new();

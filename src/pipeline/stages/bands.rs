@@ -31,12 +31,12 @@ const NAME: &str = "bands";
 /// full SH degree, the list of omitted work contains this name.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
-/// Returns the SH degree of a result of `scene` if the user asks for at most `degree`:
+/// Returns the SH degree of a result of `scene` if it may be at most `degree`, for the reason `reason`:
 /// - if the degree of the input is not higher than `degree`: the degree of the input;
 /// - if the format of the input needs all degrees: the degree of the input, and the journal (record of the run) gets
 ///   the reason;
 /// - otherwise: `degree`, and the journal gets a note that higher coefficients are dropped.
-pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
+pub(crate) fn highest(scene: &Scene, degree: usize, reason: &str, journal: &mut Journal) -> usize {
     let all = scene.source().info().sh_degree;
     match scene.input.reason_to_keep_sh_degree() {
         _ if degree >= all => all,
@@ -45,7 +45,7 @@ pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> us
             all
         }
         None => {
-            journal.notes.push(format!("SH coefficients above degree {degree} of {all} are dropped, as requested"));
+            journal.notes.push(format!("SH coefficients above degree {degree} of {all} are dropped, {reason}"));
             degree
         }
     }
@@ -79,7 +79,7 @@ impl Stage for ShDegreeStage {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let scene = run.scene;
-        // An SH degree that the user or a byte limit determined stays.
+        // An SH degree that the user, the kind of output or a byte limit determined stays.
         if run.template.sh_degree < scene.source().info().sh_degree {
             return Ok(());
         }

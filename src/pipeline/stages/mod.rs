@@ -45,4 +45,5 @@ pub(super) const STAGES: &[PlanStage] = &[
     archive::plan,
     quality::plan,
     write::plan,
+    quality::plan_for_output,
 ];

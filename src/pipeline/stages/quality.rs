@@ -6,9 +6,14 @@
 //! is reported. It is labeled as such, because these views were used to choose the best state of refinement. Without
 //! test and validation views, training views are measured.
 //!
+//! Usually the stage runs before the result is written. If the output stores rounded values or fitted motion
+//! ([`Fidelity::Approximate`]), the stage that writes the output calls it with the written file instead, and validation
+//! views, on which only the result before writing was measured, are not used.
+//!
 //! Memory: one state (all Gaussians at one frame) of each model, two views per thread, and the scores.
 
 use std::fs;
+use std::path::Path;
 use std::time::Instant;
 
 use rayon::prelude::*;
@@ -21,6 +26,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, Throughput, Workload, bytes_of_survivors};
 use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
 use crate::model::FrameView;
+use crate::outputs::kind::Fidelity;
 use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
@@ -55,20 +61,27 @@ const TIMED_VIEWS: usize = 3;
 #[derive(Debug, Clone)]
 pub(crate) struct QualityStage {
     input: InputOptions,
+    fidelity: Fidelity,
     /// Whether the result may have proxies (Gaussians that replace merged clusters), each of which is computed from
     /// several Gaussians of the input.
     merges: bool,
 }
 
-/// Adds the stage that measures the quality of the result to `stages` if the plan has memory for it. If it has not,
-/// records this in `stages`.
+/// Adds the stage that measures the quality of the result to `stages` if the plan has memory for it and if the output
+/// does not change it. If memory does not suffice, records this in `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     match planning.measures_quality {
-        true => {
-            let input = planning.request.input.clone();
-            stages.add(Phase::Write, QualityStage { input, merges: planning.merges });
-        }
+        true if planning.output.fidelity() == Fidelity::Approximate => (),
+        true => stages.add(Phase::Write, QualityStage::from_planning(planning)),
         false => leave_out(stages),
+    }
+}
+
+/// Adds the stage that measures the quality of the written output to `stages` if the plan has memory for it and if the
+/// output is only approximately the result.
+pub(super) fn plan_for_output(planning: &Planning<'_>, stages: &mut StageList) {
+    if planning.measures_quality && planning.output.fidelity() == Fidelity::Approximate {
+        stages.add(Phase::Write, QualityStage::from_planning(planning));
     }
 }
 
@@ -89,15 +102,33 @@ impl Stage for QualityStage {
         true
     }
 
+    /// Returns `None` for an output that has the values of the result, and if memory may not suffice: the output has
+    /// more Gaussians than the input, for which the memory was planned.
+    fn measure_output(&self, run: &RunState<'_>, path: &Path, journal: &mut Journal) -> Result<Option<QualitySummary>> {
+        let (scene, count) = (run.scene, run.result.len());
+        if count == 0 || self.fidelity != Fidelity::Approximate {
+            return Ok(None);
+        }
+        let output = open_compressed(path, scene, &self.input)?;
+        let is_larger = output.source().info().count > scene.source().info().count;
+        if is_larger && self.input.memory.bytes.is_some() {
+            return Ok(None);
+        }
+        journal.run_stage(NAME, count, scene.source(), |journal| {
+            Ok((self.measure(run, Some(output.source()), journal)?, count))
+        })
+    }
+
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         run.scene.work.end_shard_run_before("measuring quality")?;
-        if run.result.is_empty() {
+        // The quality of such an output was measured when it was written.
+        if run.result.is_empty() || self.fidelity == Fidelity::Approximate {
             return Ok(());
         }
         let (scene, count) = (run.scene, run.result.len());
         let mut journal = std::mem::take(&mut run.journal);
         let quality =
-            journal.run_stage(NAME, count, scene.source(), |journal| Ok((self.measure(run, journal)?, count)))?;
+            journal.run_stage(NAME, count, scene.source(), |journal| Ok((self.measure(run, None, journal)?, count)))?;
         run.journal = journal;
         run.quality = quality;
         Ok(())
@@ -105,6 +136,11 @@ impl Stage for QualityStage {
 }
 
 impl QualityStage {
+    fn from_planning(planning: &Planning<'_>) -> QualityStage {
+        let Planning { request, output, merges, .. } = *planning;
+        QualityStage { input: request.input.clone(), fidelity: output.fidelity(), merges }
+    }
+
     /// Returns the resource estimate of the stage, which renders views of the original and of the result.
     /// `output_fraction`: number of Gaussians in the result divided by that in the input.
     fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
@@ -124,19 +160,28 @@ impl QualityStage {
         }
     }
 
-    /// Measures the quality of the result of `run` on the first of these sets of views that exists:
+    /// Measures the quality of the result of `run`, or of the output `written` that was made from it, on the first of
+    /// these sets of views that exists:
     /// - test views;
-    /// - validation views of refinement, whose PSNR is taken from `journal`, the log of the run;
+    /// - unless there is an output, validation views of refinement, whose PSNR is taken from `journal`, the log of the
+    ///   run;
     /// - training views, or views of cameras placed by the program.
     ///
     /// Returns `None` if the result is an archive of frames: its frames exist only once it is written.
-    fn measure(&self, run: &RunState<'_>, journal: &mut Journal) -> Result<Option<QualitySummary>> {
+    fn measure(
+        &self,
+        run: &RunState<'_>,
+        written: Option<&dyn FrameSource>,
+        journal: &mut Journal,
+    ) -> Result<Option<QualitySummary>> {
         let scene = run.scene;
         let times = &scene.source().info().times;
         let kind = match scene.rig.held_out_split() {
             Some(_) => ViewKind::Test,
             // After a fit to photographs, the PSNR of validation views in the journal is that of the model before it.
-            None if journal.refined.is_some() && journal.photographs.is_none() => ViewKind::Validation,
+            None if written.is_none() && journal.refined.is_some() && journal.photographs.is_none() => {
+                ViewKind::Validation
+            }
             None if scene.has_cameras => ViewKind::Training,
             None => ViewKind::Virtual,
         };
@@ -144,12 +189,13 @@ impl QualityStage {
         let views = spread_views(all, self.view_count(run));
         let folder;
         let (opened, reduced);
-        let result: &dyn FrameSource = match &run.archived {
-            None => {
+        let result: &dyn FrameSource = match (written, &run.archived) {
+            (Some(written), _) => written,
+            (None, None) => {
                 reduced = scene.input.compressed_frames(&run.result)?;
                 &*reduced
             }
-            Some(PreparedArchive::Content(encoded)) => {
+            (None, Some(PreparedArchive::Content(encoded))) => {
                 folder = ScratchFolder::new(&scene.scratch)?;
                 let path = folder.path().join("result.gsz");
                 fs::write(&path, &encoded.bytes).map_err(Error::io("write", &path))?;
@@ -157,15 +203,18 @@ impl QualityStage {
                 opened.source()
             }
             // Frames with error bounds exist only once they are written.
-            Some(PreparedArchive::Frames(_)) => return Ok(None),
+            (None, Some(PreparedArchive::Frames(_))) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
+        let before_conversion = self.fidelity == Fidelity::Unreadable;
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
             let psnr = journal.result_psnr().unwrap_or(refined.result);
-            return Ok(Some(QualitySummary { kind, views: refined.views, psnr, ssim: None, render_ms }));
+            let views = refined.views;
+            return Ok(Some(QualitySummary { kind, views, psnr, ssim: None, before_conversion, render_ms }));
         }
         let (psnr, ssim) = mean_scores(scene, result, &views)?;
-        Ok(Some(QualitySummary { kind, views: views.len(), psnr, ssim: Some(ssim), render_ms }))
+        let views = views.len();
+        Ok(Some(QualitySummary { kind, views, psnr, ssim: Some(ssim), before_conversion, render_ms }))
     }
 
     /// Returns the number of views on which quality is measured, from [`FEWEST_VIEWS`] to [`MOST_VIEWS`]. Within these

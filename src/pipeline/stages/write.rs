@@ -114,32 +114,38 @@ impl Stage for WriteStage {
         let input =
             run.input.take().ok_or_else(|| Error::internal("the input was not described before it was written"))?;
         let (merge, goal, archive) = (run.merge.take(), run.goal.take(), run.archive.take());
-        let summarize = |journal: Journal, output: ModelSize| Summary {
-            schema: summary::SCHEMA,
-            files: Vec::new(),
-            tool: TOOL.to_owned(),
-            cameras: CameraSummary::from_scene(run.scene),
-            output: name_of(&self.output),
-            gaussians: run.result.len(),
-            output_bytes: output.total(),
-            output_size: output,
-            selection: scored.selection.counts,
-            terms: scored.term_summaries(),
-            flags: scored.flags.clone(),
-            merge,
-            goal,
-            field: journal.field,
-            bands: journal.bands,
-            refined: journal.refined,
-            photographs: journal.photographs,
-            quality: run.quality,
-            archive,
-            left_out: journal.left_out,
-            notes: journal.notes,
-            planned_reads: run.scene.planned_reads,
-            forecast: journal.forecast,
-            stages: journal.stages,
-            input,
+        let measure = |path: &Path, journal: &mut Journal| match run.quality {
+            Some(quality) => Ok(Some(quality)),
+            None => run.stages.all().find_map(|stage| stage.measure_output(run, path, journal).transpose()).transpose(),
+        };
+        let summarize = |path: &Path, mut journal: Journal, output: ModelSize| {
+            Ok(Summary {
+                quality: measure(path, &mut journal)?,
+                schema: summary::SCHEMA,
+                files: Vec::new(),
+                tool: TOOL.to_owned(),
+                cameras: CameraSummary::from_scene(run.scene),
+                output: name_of(&self.output),
+                gaussians: run.result.len(),
+                output_bytes: output.total(),
+                output_size: output,
+                selection: scored.selection.counts,
+                terms: scored.term_summaries(),
+                flags: scored.flags.clone(),
+                merge,
+                goal,
+                field: journal.field,
+                bands: journal.bands,
+                refined: journal.refined,
+                photographs: journal.photographs,
+                archive,
+                left_out: journal.left_out,
+                notes: journal.notes,
+                planned_reads: run.scene.planned_reads,
+                forecast: journal.forecast,
+                stages: journal.stages,
+                input,
+            })
         };
         let archived = run.archived.as_ref();
         let mut summary = self.write(run.scene, &run.result, (&map, archived), &run.recipe, journal, summarize)?;
@@ -271,7 +277,7 @@ impl WriteStage {
     /// - `map`: for every input Gaussian its index in the output;
     /// - `archive`: content of the archive, if one is written;
     /// - `recipe`: text of the recipe file;
-    /// - `summarize`: makes the summary from the journal and the size of the result.
+    /// - `summarize`: makes the summary from the temporary path of the result, the journal and the size of the result.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails; no output is left behind then.
@@ -282,7 +288,7 @@ impl WriteStage {
         (map, archive): (&[Option<u32>], Option<&PreparedArchive>),
         recipe: &str,
         mut journal: Journal,
-        summarize: impl FnOnce(Journal, ModelSize) -> Summary,
+        summarize: impl FnOnce(&Path, Journal, ModelSize) -> Result<Summary>,
     ) -> Result<Summary> {
         let mut write = |path: &Path| -> Result<ModelSize> {
             journal.run_stage(NAME, compressed.len(), scene.source(), |journal| {
@@ -303,13 +309,10 @@ impl WriteStage {
                         ModelSize::from_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {
-                        journal.notes.extend(scene.input.write(
-                            compressed,
-                            self.kind,
-                            path,
-                            &scene.limits,
-                            &scene.events,
-                        )?);
+                        let about_file =
+                            scene.input.write(compressed, self.kind, path, &scene.limits, &scene.events)?;
+                        // Notes about the file come first, because a brief summary shows only the first notes.
+                        journal.notes.splice(0..0, about_file);
                         scene.input.size_written(self.kind, path)?
                     }
                 };
@@ -324,7 +327,7 @@ impl WriteStage {
             let size = write(staged.path())?;
             write_text(&staged.path().join(RECIPE_FILE), recipe)?;
             write_index_map(map, &staged.path().join(INDEX_MAP_FILE))?;
-            let summary = summarize(journal, size);
+            let summary = summarize(staged.path(), journal, size)?;
             write_text(&staged.path().join(SUMMARY_FILE), &summary.json())?;
             staged.commit()?;
             return Ok(summary);
@@ -334,7 +337,7 @@ impl WriteStage {
         let size = write(staged.path())?;
         write_text(&recipe_file, recipe)?;
         write_index_map(map, &index_map)?;
-        let summary = summarize(journal, size);
+        let summary = summarize(staged.path(), journal, size)?;
         write_text(&marker, &summary.json())?;
         staged.commit()?;
         Ok(summary)
