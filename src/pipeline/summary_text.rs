@@ -10,7 +10,7 @@ use crate::error::ShowPath;
 use crate::journal::records::{PhotographSummary, QualitySummary, ViewKind};
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::models::ModelSize;
-use crate::outputs::kind::OutputKind;
+use crate::outputs::kind::{Fidelity, OutputKind};
 use crate::progress::format_duration;
 use crate::refinement::photographs::FIT;
 
@@ -204,10 +204,14 @@ impl Summary {
         if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 {
             return Ok(());
         }
+        let kind = OutputKind::from_path(output, None, OutputKind::Model);
+        // A file that this program does not read cannot be shown.
+        if kind.fidelity() == Fidelity::Unreadable {
+            return Ok(());
+        }
         let stem = output.with_extension("");
         let input = Path::new(&self.input.path);
         writeln!(out, "\nSee it:   splatsieve view {} {} -o {}.html", input.shown(), output.shown(), stem.shown())?;
-        let kind = OutputKind::from_path(output, None, OutputKind::Model);
         if kind == OutputKind::Model && self.output_size.field > 0 {
             writeln!(out, "Smaller:  -o {}.gsz writes an archive, which unpacks to the same folder", stem.shown())?;
         }

@@ -98,6 +98,9 @@ fn final_report_has_count_size_quality_time_and_path() {
     assert!(most.contains("dB PSNR, 0.") && most.contains("vs. original (") && most.contains(" test views)"), "{most}");
     assert!(most.contains("\nSee it:   splatsieve view "), "{most}");
     assert!(!most.contains("left out") && !most.contains(" -> "), "{most}");
+    // Nothing here reads a `.gsd`, so its quality is not known and no command shows it.
+    let unread = workplace.done(&format!("{options} -o out.gsd"));
+    assert!(unread.contains(" test views, before conversion)") && !unread.contains("See it:"), "{unread}");
     let all = workplace.done(&format!("{options} -o again --verbose"));
     assert!(
         all.contains("left out: ") && all.contains(" -> ") && all.contains("\nGaussians              300         150"),
