@@ -85,7 +85,7 @@ def main():
                         model=model.name, kept=kept, kind=kind, setting=name, gaussians=summary["gaussians"],
                         bytes=summary["output_bytes"], psnr_db=quality["psnr"], ssim=quality["ssim"],
                     )  # fmt: skip
-            shutil.rmtree(cache)
+            shutil.rmtree(cache, ignore_errors=True)
 
 
 if __name__ == "__main__":

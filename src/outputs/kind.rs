@@ -53,7 +53,7 @@ pub enum OutputKind {
 pub enum Fidelity {
     /// The file stores the values themselves, so its renders are the same.
     Exact,
-    /// The file stores rounded values or fitted motion. Its quality is measured by reading it.
+    /// The file stores rounded values or fitted motion.
     Approximate,
     /// The file stores rounded values or fitted motion, and this program does not read files of this kind.
     Unreadable,
@@ -117,6 +117,24 @@ impl OutputKind {
             "tsog" => Some(OutputKind::Tsog),
             "gsd" => Some(OutputKind::Gsd),
             _ => None,
+        }
+    }
+
+    /// Returns the ending of file names of this kind, without the first dot; `None` for folders.
+    pub fn ending(self) -> Option<&'static str> {
+        match self {
+            OutputKind::Model | OutputKind::PlySequence | OutputKind::SogSequence => None,
+            OutputKind::Gseq => Some("gseq"),
+            OutputKind::Ply => Some("ply"),
+            OutputKind::Archive => Some("gsz"),
+            OutputKind::Splatv => Some("splatv"),
+            OutputKind::FourDgs => Some("4dgs"),
+            OutputKind::Spz | OutputKind::Spz4 => Some("spz"),
+            OutputKind::Sog => Some("sog"),
+            OutputKind::Glb => Some("glb"),
+            OutputKind::Gsd => Some("gsd"),
+            OutputKind::Ftgs => Some("ftgs.ply"),
+            OutputKind::Tsog => Some("tsog"),
         }
     }
 

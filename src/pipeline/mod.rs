@@ -152,7 +152,8 @@ fn run_stages(
         ShDegreeRule::All | ShDegreeRule::Needed => NO_SH_LIMIT,
     };
     let stored_degree = plan.output.as_ref().map_or(NO_SH_LIMIT, |output| output.kind.max_sh_degree());
-    let (degree, reason) = match stored_degree < requested_degree {
+    let limits_degree = stored_degree < requested_degree && scene.input.reason_to_keep_sh_degree().is_none();
+    let (degree, reason) = match limits_degree {
         true => (stored_degree, "because the format of the output stores none"),
         false => (requested_degree, "as requested"),
     };

@@ -60,7 +60,7 @@ pub struct Planning<'a> {
     /// Refinement stage, which fits the survivors (Gaussians left by pruning) to renders of the original; `None` if
     /// nothing is refined.
     pub refine: Option<RefineStage>,
-    /// Whether the quality of the result is measured before it is written.
+    /// Whether the quality of the result is measured.
     pub measures_quality: bool,
     /// Whether there is memory to refine the result for the quantization of its archive.
     pub refines_archive: bool,

@@ -264,7 +264,7 @@ impl SearchStage {
         }
         let refine = self.refine.as_ref().map(RefineStage::key);
         Ok(scene.work.key(&(
-            (asked, files, self.target_views, self.fits_photographs, self.margins[0], self.margins[1], refine),
+            (asked, files, self.target_views, self.fits_photographs, self.before_conversion, self.margins, refine),
             &scored.protected,
             ranked,
             template,
@@ -421,6 +421,6 @@ fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) 
     };
     format!(
         "search for at {at} {asked} {unit}: {found}; {by_searched:.2} dB on the {searched} views of the search, \
-         {held:.2} dB on {others} other views{stage} (goal.held_views in the summary)"
+         {held:.2} dB on {others} other views (goal.held_views in the summary){stage}"
     )
 }

@@ -84,8 +84,8 @@ pub trait Stage: Debug + Send + Sync {
         false
     }
 
-    /// Measures the quality of the output of `_run` by reading it from `_path`, where it is written before it gets its
-    /// final name. The time of the measurement is added to `_journal`. Returns `None` if the stage does not measure this.
+    /// Measures the quality of the output of `_run`, which is written to `_path` until it gets its final name. Adds the
+    /// time of the measurement to `_journal`. Returns `None` if the stage does not measure the quality of outputs.
     ///
     /// # Errors
     /// Fails if the output or the input cannot be read.

@@ -163,10 +163,17 @@ impl Summary {
         Ok(())
     }
 
+    /// Returns the kind of output that the ending of its name stands for.
+    fn output_kind(&self) -> OutputKind {
+        OutputKind::from_path(Path::new(&self.output), None, OutputKind::Model)
+    }
+
     /// Returns the quality of the result as text: how close its renders are to those of the original.
     fn quality_text(&self) -> String {
         let Some(QualitySummary { kind, views, psnr, ssim, before_conversion, .. }) = self.quality else {
-            return "not measured; `splatsieve evaluate` measures it".to_owned();
+            let is_readable = self.output_kind().fidelity() != Fidelity::Unreadable;
+            let hint = if is_readable { "; `splatsieve evaluate` measures it" } else { "" };
+            return format!("not measured{hint}");
         };
         let views = match kind {
             ViewKind::Test => counted(views, "test view"),
@@ -174,7 +181,7 @@ impl Summary {
             ViewKind::Training => counted(views, "training view"),
             ViewKind::Virtual => counted(views, "virtual view"),
         };
-        let views = if before_conversion { views + ", before conversion" } else { views };
+        let views = if before_conversion { views + ", before conversion to the format of the output" } else { views };
         if psnr >= PSNR_CAP_DB {
             return format!("no difference from the original ({views})");
         }
@@ -204,7 +211,7 @@ impl Summary {
         if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 {
             return Ok(());
         }
-        let kind = OutputKind::from_path(output, None, OutputKind::Model);
+        let kind = self.output_kind();
         // A file that this program does not read cannot be shown.
         if kind.fidelity() == Fidelity::Unreadable {
             return Ok(());

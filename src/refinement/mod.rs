@@ -89,8 +89,8 @@ pub struct RefineStage {
     pub steps_per_prune: usize,
     /// Number and kinds of target views (renders of the original that the Gaussians are fitted to).
     pub target_views: TargetViewParams,
-    /// Whether validation views choose among the parameters that the final steps pass through. Otherwise those after
-    /// the last step are kept.
+    /// Whether validation views choose among the parameters that the final steps pass through. Otherwise the mean over
+    /// the last of these steps is kept.
     pub validates: bool,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub prunes: bool,
@@ -283,6 +283,8 @@ impl RefineStage {
         let first = wanted.max(self.min_start_count_fraction().unwrap_or(0.0));
         let stages = [Some(original), Some(phase(first, None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
+        // There may be fewer views than are asked for. Their number is 0 if it is not known.
+        let own = if work.frame_views > 0 { own.min(work.frame_views as usize) } else { own };
         let (target_views, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let prune_counts =

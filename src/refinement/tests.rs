@@ -425,7 +425,7 @@ fn without_new_cameras_all_target_views_are_from_the_scene() {
 }
 
 #[test]
-fn without_validation_the_result_of_the_last_step_stays() {
+fn without_validation_a_worse_result_stays() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let recipe = Recipe::preset("default").unwrap();

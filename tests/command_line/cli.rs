@@ -100,7 +100,10 @@ fn final_report_has_count_size_quality_time_and_path() {
     assert!(!most.contains("left out") && !most.contains(" -> "), "{most}");
     // Nothing here reads a `.gsd`, so its quality is not known and no command shows it.
     let unread = workplace.done(&format!("{options} -o out.gsd"));
-    assert!(unread.contains(" test views, before conversion)") && !unread.contains("See it:"), "{unread}");
+    assert!(
+        unread.contains(" test views, before conversion to the format of the output)") && !unread.contains("See it:"),
+        "{unread}"
+    );
     let all = workplace.done(&format!("{options} -o again --verbose"));
     assert!(
         all.contains("left out: ") && all.contains(" -> ") && all.contains("\nGaussians              300         150"),

@@ -178,6 +178,7 @@ fn reported_quality_equals_evaluate_on_the_same_views() {
     for output in ["out", "out.gsz", "out.splatv", "out.ftgs.ply", "out.tsog"] {
         let summary =
             workplace.summary(&format!("{{tiny}} --cameras {{tiny}} --ratio 0.4 --set refine_steps=40 -o {output}"));
+        assert!(summary["quality"]["before_conversion"].is_null(), "{output} was not read back");
         let quality = &summary["quality"];
         assert_eq!(quality["kind"], "test", "{quality}");
         let views = quality["views"].as_u64().unwrap();

@@ -47,8 +47,12 @@ fn a_still_is_written_read_and_compressed_as_sog() {
     assert!(psnr(&workplace, "still.ply still.sog") > 35.0);
     let options = "--count 20 --no-refine --prune-only";
     for input in ["still.ply", "still.sog"] {
-        let summary = workplace.summary(&format!("{input} -o small.sog {options} --overwrite"));
-        assert_eq!(summary["gaussians"], 20, "{input}");
+        for output in ["small.sog", "small.spz"] {
+            let summary = workplace.summary(&format!("{input} -o {output} {options} --overwrite"));
+            assert_eq!(summary["gaussians"], 20, "{input}");
+            let quality = &summary["quality"];
+            assert!(quality["psnr"].is_f64() && quality["before_conversion"].is_null(), "{output}: {quality}");
+        }
     }
     workplace.done("convert small.sog back.ply");
     workplace.done(&format!("compress small.sog -o small.gsz --count 15 {}", "--no-refine --prune-only"));

@@ -45,5 +45,6 @@ pub(super) const STAGES: &[PlanStage] = &[
     archive::plan,
     quality::plan,
     write::plan,
+    // Called by the stage that writes the output.
     quality::plan_for_output,
 ];

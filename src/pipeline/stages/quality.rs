@@ -6,9 +6,9 @@
 //! is reported. It is labeled as such, because these views were used to choose the best state of refinement. Without
 //! test and validation views, training views are measured.
 //!
-//! Usually the stage runs before the result is written. If the output stores rounded values or fitted motion
-//! ([`Fidelity::Approximate`]), the stage that writes the output calls it with the written file instead, and validation
-//! views, on which only the result before writing was measured, are not used.
+//! The stage runs before the result is written. Only if the output stores rounded values or fitted motion
+//! ([`Fidelity::Approximate`]), the stage that writes the output calls it with the written file. Validation views are
+//! not measured then, because their PSNR is known only for the result before it was written.
 //!
 //! Memory: one state (all Gaussians at one frame) of each model, two views per thread, and the scores.
 
@@ -25,8 +25,9 @@ use crate::journal::records::{QualitySummary, RenderTime, ViewKind};
 use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, Throughput, Workload, bytes_of_survivors};
 use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
-use crate::model::FrameView;
-use crate::outputs::kind::Fidelity;
+use crate::model::{Attributes, FrameView};
+use crate::models::InputModel;
+use crate::outputs::kind::{Fidelity, OutputKind};
 use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
@@ -54,6 +55,9 @@ const MERGED_READS: f64 = 6.0;
 /// This optional stage runs only if memory is plentiful: at least this number of bytes must remain free within the
 /// memory limit, beyond the estimate.
 const MARGIN: u64 = 8 << 20;
+/// Assumed maximum number of bytes that a written output takes once it is open, divided by the bytes of a state of the
+/// result: up to about twelve pieces of motion for each Gaussian, twice in memory.
+const WRITTEN_COPIES: u64 = 24;
 /// Number of views whose rendering is timed, on one thread.
 const TIMED_VIEWS: usize = 3;
 
@@ -61,24 +65,27 @@ const TIMED_VIEWS: usize = 3;
 #[derive(Debug, Clone)]
 pub(crate) struct QualityStage {
     input: InputOptions,
-    fidelity: Fidelity,
+    /// Kind of the output.
+    kind: OutputKind,
     /// Whether the result may have proxies (Gaussians that replace merged clusters), each of which is computed from
     /// several Gaussians of the input.
     merges: bool,
 }
 
-/// Adds the stage that measures the quality of the result to `stages` if the plan has memory for it and if the output
-/// does not change it. If memory does not suffice, records this in `stages`.
+/// Adds the stage that measures the quality of the result before it is written to `stages`, if the plan has memory for
+/// it and the quality is not measured on the written file. If memory does not suffice, records this in `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     match planning.measures_quality {
-        true if planning.output.fidelity() == Fidelity::Approximate => (),
-        true => stages.add(Phase::Write, QualityStage::from_planning(planning)),
+        true if planning.output.fidelity() != Fidelity::Approximate => {
+            stages.add(Phase::Write, QualityStage::from_planning(planning));
+        }
+        true => (),
         false => leave_out(stages),
     }
 }
 
-/// Adds the stage that measures the quality of the written output to `stages` if the plan has memory for it and if the
-/// output is only approximately the result.
+/// Adds the stage that measures the quality of the written output to `stages`, if the plan has memory for it and the
+/// output stores the result only approximately. The stage that writes the output calls it.
 pub(super) fn plan_for_output(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.measures_quality && planning.output.fidelity() == Fidelity::Approximate {
         stages.add(Phase::Write, QualityStage::from_planning(planning));
@@ -102,27 +109,23 @@ impl Stage for QualityStage {
         true
     }
 
-    /// Returns `None` for an output that has the values of the result, and if memory may not suffice: the output has
-    /// more Gaussians than the input, for which the memory was planned.
+    /// Measures the written file if it can be read back; otherwise, as for an output that this program does not read, the
+    /// result before its conversion. Returns `None` for an output that stores the result exactly.
     fn measure_output(&self, run: &RunState<'_>, path: &Path, journal: &mut Journal) -> Result<Option<QualitySummary>> {
         let (scene, count) = (run.scene, run.result.len());
-        if count == 0 || self.fidelity != Fidelity::Approximate {
-            return Ok(None);
-        }
-        let output = open_compressed(path, scene, &self.input)?;
-        let is_larger = output.source().info().count > scene.source().info().count;
-        if is_larger && self.input.memory.bytes.is_some() {
+        if count == 0 || !self.is_measured_once_written() {
             return Ok(None);
         }
         journal.run_stage(NAME, count, scene.source(), |journal| {
-            Ok((self.measure(run, Some(output.source()), journal)?, count))
+            let output = self.open_output(scene, path);
+            let written = output.as_ref().map(|(_, output)| output.source());
+            Ok((self.measure(run, written, journal)?, count))
         })
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         run.scene.work.end_shard_run_before("measuring quality")?;
-        // The quality of such an output was measured when it was written.
-        if run.result.is_empty() || self.fidelity == Fidelity::Approximate {
+        if run.result.is_empty() || self.is_measured_once_written() {
             return Ok(());
         }
         let (scene, count) = (run.scene, run.result.len());
@@ -138,7 +141,33 @@ impl Stage for QualityStage {
 impl QualityStage {
     fn from_planning(planning: &Planning<'_>) -> QualityStage {
         let Planning { request, output, merges, .. } = *planning;
-        QualityStage { input: request.input.clone(), fidelity: output.fidelity(), merges }
+        QualityStage { input: request.input.clone(), kind: output, merges }
+    }
+
+    /// Returns whether the quality is measured when the output is written, and not before.
+    fn is_measured_once_written(&self) -> bool {
+        self.kind.fidelity() == Fidelity::Approximate
+    }
+
+    /// Opens the output that was written to `path`, as a copy in a scratch folder with the ending of its kind. Returns
+    /// `None` if it is not read back:
+    /// - it is a folder, because all of its frames would have to be decoded;
+    /// - there is a memory limit, because a file may hold many more Gaussians than the result;
+    /// - it is a `.splatv` and the times of the frames are not from 0 to 1, because the file then has scaled times;
+    /// - reading it fails.
+    fn open_output(&self, scene: &Scene, path: &Path) -> Option<(ScratchFolder, Box<dyn InputModel>)> {
+        let has_scaled_times = || scene.source().info().times.iter().any(|time| !(0.0..=1.0).contains(time));
+        if self.kind.is_folder()
+            || self.input.memory.bytes.is_some()
+            || (self.kind == OutputKind::Splatv && has_scaled_times())
+        {
+            return None;
+        }
+        let folder = ScratchFolder::new(&scene.scratch).ok()?;
+        let copy = folder.path().join(format!("result.{}", self.kind.ending()?));
+        fs::copy(path, &copy).ok()?;
+        let output = open_compressed(&copy, scene, &self.input).ok()?;
+        Some((folder, output))
     }
 
     /// Returns the resource estimate of the stage, which renders views of the original and of the result.
@@ -146,7 +175,10 @@ impl QualityStage {
     fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.frame_views.max(1));
         let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
+        let written =
+            if self.is_measured_once_written() { WRITTEN_COPIES * work.state_bytes(Attributes::all()) } else { 0 };
         let result = vec![
+            ("written output", bytes_of_survivors(output_fraction, written)),
             ("survivors", bytes_of_survivors(output_fraction, 24)),
             ("result", bytes_of_survivors(output_fraction, 2 * work.input.compressed)),
         ];
@@ -206,7 +238,7 @@ impl QualityStage {
             (None, Some(PreparedArchive::Frames(_))) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
-        let before_conversion = self.fidelity == Fidelity::Unreadable;
+        let before_conversion = written.is_none() && !matches!(self.kind.fidelity(), Fidelity::Exact);
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
             let psnr = journal.result_psnr().unwrap_or(refined.result);
             let views = refined.views;

@@ -311,8 +311,10 @@ impl WriteStage {
                     None => {
                         let about_file =
                             scene.input.write(compressed, self.kind, path, &scene.limits, &scene.events)?;
-                        // Notes about the file come first, because a brief summary shows only the first notes.
-                        journal.notes.splice(0..0, about_file);
+                        let mut about_file = about_file.into_iter();
+                        // A brief summary shows only the first notes.
+                        journal.notes.splice(0..0, about_file.next());
+                        journal.notes.extend(about_file);
                         scene.input.size_written(self.kind, path)?
                     }
                 };
