@@ -5,7 +5,7 @@
 //! through them. `format/SUMMARY.md` documents the fields for other programs.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -224,6 +224,10 @@ pub struct Summary {
     /// given by the user.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
+    /// Path of the cameras, if the user gave one. It is part of the command that the text of the summary proposes, and
+    /// is not written to files.
+    #[serde(skip)]
+    pub given_cameras: Option<PathBuf>,
     /// Number of Gaussians in the output.
     pub gaussians: usize,
     /// Number of bytes of all output files that a renderer opens.

@@ -218,7 +218,10 @@ impl Summary {
         }
         let stem = output.with_extension("");
         let input = Path::new(&self.input.path);
-        writeln!(out, "\nSee it:   splatsieve view {} {} -o {}.html", input.shown(), output.shown(), stem.shown())?;
+        let given = self.given_cameras.as_deref().filter(|&cameras| cameras != input);
+        let cameras = given.map_or(String::new(), |cameras| format!(" --cameras {}", cameras.shown()));
+        let [original, result, page] = [input, output, &stem].map(ShowPath::shown);
+        writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}.html")?;
         if kind == OutputKind::Model && self.output_size.field > 0 {
             writeln!(out, "Smaller:  -o {}.gsz writes an archive, which unpacks to the same folder", stem.shown())?;
         }

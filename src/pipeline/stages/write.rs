@@ -126,6 +126,7 @@ impl Stage for WriteStage {
                 tool: TOOL.to_owned(),
                 cameras: CameraSummary::from_scene(run.scene),
                 output: name_of(&self.output),
+                given_cameras: run.request.input.cameras.clone(),
                 gaussians: run.result.len(),
                 output_bytes: output.total(),
                 output_size: output,
