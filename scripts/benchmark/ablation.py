@@ -58,7 +58,7 @@ def stages(kept):
         ARCHIVE: [],
         "default, rounds of 48 views": sets(*ROUNDS_OF_48_VIEWS),
         "default, no views outside the rig": sets("outside=0"),
-        "default, no views between cameras": sets("refine_between=false"),
+        "default, only views of the scene's cameras": sets("refine_between=false"),
         "default, without validation": sets("refine_validate=false"),
     }
 

@@ -152,8 +152,13 @@ fn run_stages(
         ShDegreeRule::All | ShDegreeRule::Needed => NO_SH_LIMIT,
     };
     let stored_degree = plan.output.as_ref().map_or(NO_SH_LIMIT, |output| output.kind.max_sh_degree());
-    let limits_degree = stored_degree < requested_degree && scene.input.reason_to_keep_sh_degree().is_none();
-    let (degree, reason) = match limits_degree {
+    let limits_degree = stored_degree < requested_degree.min(scene.source().info().sh_degree);
+    let reason_to_keep = scene.input.reason_to_keep_sh_degree().filter(|_| limits_degree);
+    if let Some(why) = reason_to_keep {
+        let what = "the format of the output has no SH coefficients above degree";
+        journal.notes.push(format!("{what} {stored_degree}; colors were not refined for this: {why}"));
+    }
+    let (degree, reason) = match limits_degree && reason_to_keep.is_none() {
         true => (stored_degree, "because the format of the output stores none"),
         false => (requested_degree, "as requested"),
     };

@@ -10,7 +10,7 @@ use crate::error::ShowPath;
 use crate::journal::records::{PhotographSummary, QualitySummary, ViewKind};
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::models::ModelSize;
-use crate::outputs::kind::{Fidelity, OutputKind};
+use crate::outputs::kind::OutputKind;
 use crate::progress::format_duration;
 use crate::refinement::photographs::FIT;
 
@@ -163,16 +163,10 @@ impl Summary {
         Ok(())
     }
 
-    /// Returns the kind of output that the ending of its name stands for.
-    fn output_kind(&self) -> OutputKind {
-        OutputKind::from_path(Path::new(&self.output), None, OutputKind::Model)
-    }
-
     /// Returns the quality of the result as text: how close its renders are to those of the original.
     fn quality_text(&self) -> String {
         let Some(QualitySummary { kind, views, psnr, ssim, before_conversion, .. }) = self.quality else {
-            let is_readable = self.output_kind().fidelity() != Fidelity::Unreadable;
-            let hint = if is_readable { "; `splatsieve evaluate` measures it" } else { "" };
+            let hint = if self.is_readable { "; `splatsieve evaluate` measures it" } else { "" };
             return format!("not measured{hint}");
         };
         let views = match kind {
@@ -208,17 +202,13 @@ impl Summary {
     /// Writes to `out` commands that the user may want to run next.
     fn write_next_steps(&self, out: &mut String) -> std::fmt::Result {
         let output = Path::new(&self.output);
-        if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 {
+        if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 || !self.is_readable {
             return Ok(());
         }
-        let kind = self.output_kind();
-        // A file that this program does not read cannot be shown.
-        if kind.fidelity() == Fidelity::Unreadable {
-            return Ok(());
-        }
+        let kind = OutputKind::from_path(output, None, OutputKind::Model);
         let stem = output.with_extension("");
         let input = Path::new(&self.input.path);
-        let given = self.given_cameras.as_deref().filter(|&cameras| cameras != input);
+        let given = self.given_cameras.as_deref();
         let cameras = given.map_or(String::new(), |cameras| format!(" --cameras {}", cameras.shown()));
         let [original, result, page] = [input, output, &stem].map(ShowPath::shown);
         writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}.html")?;

@@ -117,7 +117,10 @@ impl Stage for QualityStage {
             return Ok(None);
         }
         journal.run_stage(NAME, count, scene.source(), |journal| {
-            let output = self.open_output(scene, path);
+            let output = self.open_output(scene, path).unwrap_or_else(|error| {
+                journal.notes.push(format!("the written file could not be read back: {error}"));
+                None
+            });
             let written = output.as_ref().map(|(_, output)| output.source());
             Ok((self.measure(run, written, journal)?, count))
         })
@@ -149,25 +152,29 @@ impl QualityStage {
         self.kind.fidelity() == Fidelity::Approximate
     }
 
+    /// Returns whether an output is never read back: a folder, because all of its frames would have to be decoded; and
+    /// any output if there is a memory limit, because a file may hold many more Gaussians than the result.
+    fn reads_no_output(&self) -> bool {
+        self.kind.is_folder() || self.input.memory.bytes.is_some()
+    }
+
     /// Opens the output that was written to `path`, as a copy in a scratch folder with the ending of its kind. Returns
-    /// `None` if it is not read back:
-    /// - it is a folder, because all of its frames would have to be decoded;
-    /// - there is a memory limit, because a file may hold many more Gaussians than the result;
-    /// - it is a `.splatv` and the times of the frames are not from 0 to 1, because the file then has scaled times;
-    /// - reading it fails.
-    fn open_output(&self, scene: &Scene, path: &Path) -> Option<(ScratchFolder, Box<dyn InputModel>)> {
+    /// `None` if it is not read back: see [`QualityStage::reads_no_output`], and a `.splatv` if the times of the frames
+    /// are not from 0 to 1, because the file then has scaled times.
+    ///
+    /// # Errors
+    /// Fails if the output cannot be copied or read.
+    fn open_output(&self, scene: &Scene, path: &Path) -> Result<Option<(ScratchFolder, Box<dyn InputModel>)>> {
         let has_scaled_times = || scene.source().info().times.iter().any(|time| !(0.0..=1.0).contains(time));
-        if self.kind.is_folder()
-            || self.input.memory.bytes.is_some()
-            || (self.kind == OutputKind::Splatv && has_scaled_times())
-        {
-            return None;
-        }
-        let folder = ScratchFolder::new(&scene.scratch).ok()?;
-        let copy = folder.path().join(format!("result.{}", self.kind.ending()?));
-        fs::copy(path, &copy).ok()?;
-        let output = open_compressed(&copy, scene, &self.input).ok()?;
-        Some((folder, output))
+        let ending = self.kind.ending().filter(|_| !self.reads_no_output());
+        let Some(ending) = ending.filter(|_| self.kind != OutputKind::Splatv || !has_scaled_times()) else {
+            return Ok(None);
+        };
+        let folder = ScratchFolder::new(&scene.scratch)?;
+        let copy = folder.path().join(format!("result.{ending}"));
+        fs::copy(path, &copy).map_err(Error::io("copy", path))?;
+        let output = open_compressed(&copy, scene, &self.input)?;
+        Ok(Some((folder, output)))
     }
 
     /// Returns the resource estimate of the stage, which renders views of the original and of the result.
@@ -175,8 +182,8 @@ impl QualityStage {
     fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.frame_views.max(1));
         let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
-        let written =
-            if self.is_measured_once_written() { WRITTEN_COPIES * work.state_bytes(Attributes::all()) } else { 0 };
+        let is_read_back = self.is_measured_once_written() && !self.reads_no_output();
+        let written = if is_read_back { WRITTEN_COPIES * work.state_bytes(Attributes::all()) } else { 0 };
         let result = vec![
             ("written output", bytes_of_survivors(output_fraction, written)),
             ("survivors", bytes_of_survivors(output_fraction, 24)),

@@ -23,7 +23,7 @@ use crate::models::{InputModel, ModelSize};
 use crate::outputs::bounds::ErrorBounds;
 use crate::outputs::container::{FRAME_BLOCK, write_container};
 use crate::outputs::index_map::write_index_map;
-use crate::outputs::kind::OutputKind;
+use crate::outputs::kind::{Fidelity, OutputKind};
 use crate::passes::gather_all;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{CompressedScene, EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
@@ -127,6 +127,7 @@ impl Stage for WriteStage {
                 cameras: CameraSummary::from_scene(run.scene),
                 output: name_of(&self.output),
                 given_cameras: run.request.input.cameras.clone(),
+                is_readable: self.kind.fidelity() != Fidelity::Unreadable,
                 gaussians: run.result.len(),
                 output_bytes: output.total(),
                 output_size: output,
