@@ -48,6 +48,23 @@ pub enum OutputKind {
     Tsog,
 }
 
+/// Endings of file names, each with the kind of output that has it. Of two kinds with one ending, the name stands for the
+/// first.
+const ENDINGS: [(&str, OutputKind); 12] = [
+    ("gseq", OutputKind::Gseq),
+    ("ply", OutputKind::Ply),
+    ("gsz", OutputKind::Archive),
+    ("splatv", OutputKind::Splatv),
+    ("4dgs", OutputKind::FourDgs),
+    ("spz", OutputKind::Spz),
+    ("spz", OutputKind::Spz4),
+    ("sog", OutputKind::Sog),
+    ("glb", OutputKind::Glb),
+    ("tsog", OutputKind::Tsog),
+    ("gsd", OutputKind::Gsd),
+    ("ftgs.ply", OutputKind::Ftgs),
+];
+
 /// Relation of the renders of an output file to those of the result that is stored in it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fidelity {
@@ -105,37 +122,13 @@ impl OutputKind {
         if has_ending(path, ".compressed.ply") {
             return None;
         }
-        match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
-            "gseq" => Some(OutputKind::Gseq),
-            "ply" => Some(OutputKind::Ply),
-            "gsz" => Some(OutputKind::Archive),
-            "splatv" => Some(OutputKind::Splatv),
-            "4dgs" => Some(OutputKind::FourDgs),
-            "spz" => Some(OutputKind::Spz),
-            "sog" => Some(OutputKind::Sog),
-            "glb" => Some(OutputKind::Glb),
-            "tsog" => Some(OutputKind::Tsog),
-            "gsd" => Some(OutputKind::Gsd),
-            _ => None,
-        }
+        let ending = path.extension()?.to_str()?.to_ascii_lowercase();
+        ENDINGS.iter().find(|(known, _)| *known == ending).map(|(_, kind)| *kind)
     }
 
     /// Returns the ending of file names of this kind, without the first dot; `None` for folders.
     pub fn ending(self) -> Option<&'static str> {
-        match self {
-            OutputKind::Model | OutputKind::PlySequence | OutputKind::SogSequence => None,
-            OutputKind::Gseq => Some("gseq"),
-            OutputKind::Ply => Some("ply"),
-            OutputKind::Archive => Some("gsz"),
-            OutputKind::Splatv => Some("splatv"),
-            OutputKind::FourDgs => Some("4dgs"),
-            OutputKind::Spz | OutputKind::Spz4 => Some("spz"),
-            OutputKind::Sog => Some("sog"),
-            OutputKind::Glb => Some("glb"),
-            OutputKind::Gsd => Some("gsd"),
-            OutputKind::Ftgs => Some("ftgs.ply"),
-            OutputKind::Tsog => Some("tsog"),
-        }
+        ENDINGS.iter().find(|(_, kind)| *kind == self).map(|(ending, _)| *ending)
     }
 
     /// Returns whether this kind of output is a folder rather than a file.

@@ -31,9 +31,8 @@ use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload, stage_seconds};
-use crate::model::NO_SH_LIMIT;
 use crate::pruning::score::{Scored, UserOverrides};
-use crate::recipe::{Recipe, ShDegreeRule};
+use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
 use planning::InputMeta;
 use stage::{Measured, Phase, RunState};
@@ -147,22 +146,8 @@ fn run_stages(
         scene.events.begin_run(&stage_seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
     let input = InputSummary::from_scene(scene)?.without_folder_paths();
     let recipe = recipe_text(&input.digest, plan, request, &mut journal);
-    let requested_degree = match request.recipe.bands.bands {
-        ShDegreeRule::UpTo(degree) => degree,
-        ShDegreeRule::All | ShDegreeRule::Needed => NO_SH_LIMIT,
-    };
-    let stored_degree = plan.output.as_ref().map_or(NO_SH_LIMIT, |output| output.kind.max_sh_degree());
-    let limits_degree = stored_degree < requested_degree.min(scene.source().info().sh_degree);
-    let reason_to_keep = scene.input.reason_to_keep_sh_degree().filter(|_| limits_degree);
-    if let Some(why) = reason_to_keep {
-        let what = "the format of the output has no SH coefficients above degree";
-        journal.notes.push(format!("{what} {stored_degree}; colors were not refined for this: {why}"));
-    }
-    let (degree, reason) = match limits_degree && reason_to_keep.is_none() {
-        true => (stored_degree, "because the format of the output stores none"),
-        false => (requested_degree, "as requested"),
-    };
-    let sh_degree = stages::bands::highest(scene, degree, reason, &mut journal);
+    let output = plan.output.as_ref().map(|output| output.kind);
+    let sh_degree = stages::bands::highest(scene, request.recipe.bands.bands, output, &mut journal);
     let template = CompressedModel { sh_degree, ..CompressedModel::pruned(Vec::new(), &request.recipe.merge) };
     let mut run = RunState::new(scene, request, &plan.stages, template);
     (run.journal, run.input, run.recipe) = (journal, Some(input), recipe);

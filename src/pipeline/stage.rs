@@ -84,8 +84,8 @@ pub trait Stage: Debug + Send + Sync {
         false
     }
 
-    /// Measures the quality of the output of `_run`, which is written to `_path` until it gets its final name. Adds the
-    /// time of the measurement to `_journal`. Returns `None` if the stage does not measure the quality of outputs.
+    /// Measures the quality of the output of the run `_run`. `_path` is the temporary path to which the output has been
+    /// written. Adds the time of the measurement to `_journal`. Returns `None` for stages that do not measure outputs.
     ///
     /// # Errors
     /// Fails if the output or the input cannot be read.

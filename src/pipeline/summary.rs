@@ -228,9 +228,9 @@ pub struct Summary {
     /// is not written to files.
     #[serde(skip)]
     pub given_cameras: Option<PathBuf>,
-    /// Whether this program can read the output. Not written to files.
-    #[serde(skip, default = "readable")]
-    pub is_readable: bool,
+    /// Whether the output has a format that this program does not read. Not written to files.
+    #[serde(skip)]
+    pub is_unreadable: bool,
     /// Number of Gaussians in the output.
     pub gaussians: usize,
     /// Number of bytes of all output files that a renderer opens.
@@ -278,11 +278,6 @@ pub struct Summary {
     /// files. Set once all files are written.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub files: Vec<String>,
-}
-
-/// Returns true, the value of [`Summary::is_readable`] in a summary that was read from a file.
-fn readable() -> bool {
-    true
 }
 
 impl Summary {

@@ -166,7 +166,7 @@ impl Summary {
     /// Returns the quality of the result as text: how close its renders are to those of the original.
     fn quality_text(&self) -> String {
         let Some(QualitySummary { kind, views, psnr, ssim, before_conversion, .. }) = self.quality else {
-            let hint = if self.is_readable { "; `splatsieve evaluate` measures it" } else { "" };
+            let hint = if self.is_unreadable { "" } else { "; `splatsieve evaluate` measures it" };
             return format!("not measured{hint}");
         };
         let views = match kind {
@@ -202,16 +202,16 @@ impl Summary {
     /// Writes to `out` commands that the user may want to run next.
     fn write_next_steps(&self, out: &mut String) -> std::fmt::Result {
         let output = Path::new(&self.output);
-        if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 || !self.is_readable {
+        if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 || self.is_unreadable {
             return Ok(());
         }
-        let kind = OutputKind::from_path(output, None, OutputKind::Model);
         let stem = output.with_extension("");
         let input = Path::new(&self.input.path);
         let given = self.given_cameras.as_deref();
         let cameras = given.map_or(String::new(), |cameras| format!(" --cameras {}", cameras.shown()));
         let [original, result, page] = [input, output, &stem].map(ShowPath::shown);
         writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}.html")?;
+        let kind = OutputKind::from_path(output, None, OutputKind::Model);
         if kind == OutputKind::Model && self.output_size.field > 0 {
             writeln!(out, "Smaller:  -o {}.gsz writes an archive, which unpacks to the same folder", stem.shown())?;
         }

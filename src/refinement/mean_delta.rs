@@ -7,7 +7,7 @@ use crate::compressed_model::ParamDelta;
 /// Fraction of the final steps, taken from their end, over which the parameters are averaged. The parameters after
 /// single steps scatter around the optimum; their mean is closer to it.
 const AVERAGED_FRACTION: f64 = 0.4;
-/// Number of optimization steps between two parameter deltas that are averaged.
+/// Number n: of the last optimization steps, the parameter delta after every n-th step is included in the mean.
 const AVERAGE_EVERY: usize = 4;
 
 /// Returns whether the parameters after the optimization step `step` (from 1) of `steps` are included in the mean.

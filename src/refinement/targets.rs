@@ -424,12 +424,16 @@ pub(super) fn wide(value: u16) -> f32 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn views(max_count: usize) -> TargetViewParams {
+impl TargetViewParams {
+    /// Returns parameters for at most `max_count` target views, some of them from new cameras.
+    pub(super) fn at_most(max_count: usize) -> TargetViewParams {
         TargetViewParams { max_count, between: true }
     }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
 
     #[test]
     fn sixteen_bits_are_accurate_to_1e_5() {
@@ -460,15 +464,15 @@ mod tests {
 
     #[test]
     fn large_views_are_fewer_but_never_too_few() {
-        assert_eq!(views(1000).view_counts(320 * 256), [60, 940]);
-        assert_eq!(views(520).view_counts(0), [60, 460]);
-        assert_eq!(views(1000).view_counts(1352 * 1014), [15, 115]);
-        assert_eq!(views(1000).view_counts(1 << 40), [11, 85]);
-        assert_eq!(views(40).view_counts(1 << 40), [4, 36]);
-        let own = TargetViewParams { between: false, ..views(520) };
+        assert_eq!(TargetViewParams::at_most(1000).view_counts(320 * 256), [60, 940]);
+        assert_eq!(TargetViewParams::at_most(520).view_counts(0), [60, 460]);
+        assert_eq!(TargetViewParams::at_most(1000).view_counts(1352 * 1014), [15, 115]);
+        assert_eq!(TargetViewParams::at_most(1000).view_counts(1 << 40), [11, 85]);
+        assert_eq!(TargetViewParams::at_most(40).view_counts(1 << 40), [4, 36]);
+        let own = TargetViewParams { between: false, ..TargetViewParams::at_most(520) };
         assert_eq!((own.view_counts(0), own.photograph_counts(0)), ([520, 0], [400, 0]));
-        assert_eq!(views(1000).photograph_counts(320 * 256), [400, 120]);
-        assert_eq!(views(1000).photograph_counts(1352 * 1014), [100, 30]);
+        assert_eq!(TargetViewParams::at_most(1000).photograph_counts(320 * 256), [400, 120]);
+        assert_eq!(TargetViewParams::at_most(1000).photograph_counts(1352 * 1014), [100, 30]);
     }
 
     #[test]

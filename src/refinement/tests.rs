@@ -27,11 +27,6 @@ use crate::render::render;
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Returns parameters for at most `max_count` target views, some of them from new cameras.
-fn views(max_count: usize) -> TargetViewParams {
-    TargetViewParams { max_count, between: true }
-}
-
 /// Keeps the first `count` Gaussians of the ranking of `scene` and refines them in `steps` steps. The Gaussians with
 /// the ids `keep` are protected (not changed). Returns the refined model and the journal of the run.
 fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (CompressedModel, Journal) {
@@ -126,7 +121,7 @@ fn interrupted_runs_resume_to_the_same_result() {
             let few = RefineStage {
                 steps,
                 steps_per_prune: 40,
-                target_views: views(target_views),
+                target_views: TargetViewParams::at_most(target_views),
                 ..RefineStage::from_recipe(&recipe, None, true).unwrap()
             };
             few.run(scene, &scored, compressed, count / 4, &mut Journal::default())
@@ -321,7 +316,7 @@ fn the_optimizer_restarts_and_continues_with_a_subset() {
     let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
     for scene in [explicit, open_scene(&options).unwrap()] {
-        let targets = Targets::new(&scene, views(520), NonZeroU32::MIN, false).unwrap();
+        let targets = Targets::new(&scene, TargetViewParams::at_most(520), NonZeroU32::MIN, false).unwrap();
         let count = scene.source().info().count;
         let kept = (0..count as u32).step_by(2).collect();
         let compressed = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
@@ -365,9 +360,9 @@ fn values_at_a_stride_do_not_depend_on_the_stored_stride() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let stride = |s: u32| NonZeroU32::new(s).unwrap();
-    let all = Targets::new(&scene, views(60), stride(1), true).unwrap();
+    let all = Targets::new(&scene, TargetViewParams::at_most(60), stride(1), true).unwrap();
     for stored in [2, 3] {
-        let targets = Targets::new(&scene, views(60), stride(stored), true).unwrap();
+        let targets = Targets::new(&scene, TargetViewParams::at_most(60), stride(stored), true).unwrap();
         let split = targets.split();
         assert!(!split.training.is_empty() && !split.validation.is_empty() && !split.test.is_empty());
         for k in 0..targets.views.len() {
@@ -392,7 +387,7 @@ fn a_small_weight_of_the_outside_gives_guard_views() {
     let mut scene = scene(folder.path());
     let scene_cameras = scene.schedule.cameras.len();
     let guards = |scene: &Scene| {
-        let targets = Targets::new(scene, views(500), NonZeroU32::MIN, false).unwrap();
+        let targets = Targets::new(scene, TargetViewParams::at_most(500), NonZeroU32::MIN, false).unwrap();
         (0..targets.views.len()).filter(|&k| targets.is_guard(k)).count()
     };
     assert_eq!(guards(&scene), 0);
@@ -417,7 +412,7 @@ fn without_new_cameras_all_target_views_are_from_the_scene() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let cameras = |between| {
-        let params = TargetViewParams { between, ..views(500) };
+        let params = TargetViewParams { between, ..TargetViewParams::at_most(500) };
         Targets::new(&scene, params, NonZeroU32::MIN, false).unwrap().cameras.len()
     };
     assert_eq!(cameras(false), scene.schedule.used_cameras().len());
@@ -435,7 +430,7 @@ fn without_validation_a_worse_result_stays() {
     let compressed = CompressedModel::pruned(scored.ranking().best_ids(count), &recipe.merge);
     let result = |validates| {
         let mut refine = RefineStage::from_recipe(&recipe, None, false).unwrap();
-        (refine.steps, refine.target_views, refine.validates) = (100, views(60), validates);
+        (refine.steps, refine.target_views, refine.validates) = (100, TargetViewParams::at_most(60), validates);
         let mut journal = Journal::default();
         (refine.run(&scene, &scored, compressed.clone(), count, &mut journal).unwrap().delta.is_empty(), journal)
     };

@@ -12,7 +12,7 @@ use crate::journal::records::ShDegreeSummary;
 use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::psnr;
-use crate::model::{Attributes, FrameView, Gaussians};
+use crate::model::{Attributes, FrameView, Gaussians, NO_SH_LIMIT};
 use crate::outputs::kind::OutputKind;
 use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch, select_evenly};
 use crate::pipeline::planning::Planning;
@@ -31,24 +31,34 @@ const NAME: &str = "bands";
 /// full SH degree, the list of omitted work contains this name.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
-/// Returns the SH degree of a result of `scene` if it may be at most `degree`, for the reason `reason`:
-/// - if the degree of the input is not higher than `degree`: the degree of the input;
-/// - if the format of the input needs all degrees: the degree of the input, and the journal (record of the run) gets
-///   the reason;
-/// - otherwise: `degree`, and the journal gets a note that higher coefficients are dropped.
-pub(crate) fn highest(scene: &Scene, degree: usize, reason: &str, journal: &mut Journal) -> usize {
+/// Returns the highest SH degree that a result of `scene` may have: the lowest of the degree of the input, the degree that
+/// `rule` allows, and the degree that an output of kind `output` stores. If the format of the input needs all degrees, it
+/// is the degree of the input. Adds a note to `journal`, the record of the run, if degrees are dropped, or the reason why
+/// they are not.
+pub(crate) fn highest(scene: &Scene, rule: ShDegreeRule, output: Option<OutputKind>, journal: &mut Journal) -> usize {
     let all = scene.source().info().sh_degree;
-    match scene.input.reason_to_keep_sh_degree() {
-        _ if degree >= all => all,
-        Some(why) => {
-            journal.leave_out(DROPPED_DEGREES, why);
-            all
-        }
-        None => {
-            journal.notes.push(format!("SH coefficients above degree {degree} of {all} are dropped, {reason}"));
-            degree
-        }
+    let requested = match rule {
+        ShDegreeRule::UpTo(degree) => degree,
+        ShDegreeRule::All | ShDegreeRule::Needed => NO_SH_LIMIT,
+    };
+    let stored = output.map_or(NO_SH_LIMIT, OutputKind::max_sh_degree);
+    let degree = requested.min(stored);
+    if degree >= all {
+        return all;
     }
+    if let Some(why) = scene.input.reason_to_keep_sh_degree() {
+        if requested < all {
+            journal.leave_out(DROPPED_DEGREES, why);
+        }
+        if stored < requested {
+            let what = "the format of the output has no SH coefficients above degree";
+            journal.notes.push(format!("{what} {stored}; colors were not refined for this: {why}"));
+        }
+        return all;
+    }
+    let reason = if stored < requested { "because the format of the output stores none" } else { "as requested" };
+    journal.notes.push(format!("SH coefficients above degree {degree} of {all} are dropped, {reason}"));
+    degree
 }
 
 /// Stage that lowers the SH degree of a result if renders hardly change.

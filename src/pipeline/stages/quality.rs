@@ -7,8 +7,8 @@
 //! test and validation views, training views are measured.
 //!
 //! The stage runs before the result is written. Only if the output stores rounded values or fitted motion
-//! ([`Fidelity::Approximate`]), the stage that writes the output calls it with the written file. Validation views are
-//! not measured then, because their PSNR is known only for the result before it was written.
+//! ([`Fidelity::Approximate`]), the stage that writes the output calls it with the written file. It then uses training
+//! views instead of validation views, whose PSNR belongs to the result before it was written.
 //!
 //! Memory: one state (all Gaussians at one frame) of each model, two views per thread, and the scores.
 
@@ -55,8 +55,8 @@ const MERGED_READS: f64 = 6.0;
 /// This optional stage runs only if memory is plentiful: at least this number of bytes must remain free within the
 /// memory limit, beyond the estimate.
 const MARGIN: u64 = 8 << 20;
-/// Assumed maximum number of bytes that a written output takes once it is open, divided by the bytes of a state of the
-/// result: up to about twelve pieces of motion for each Gaussian, twice in memory.
+/// Assumed memory that a written output takes once it is open, divided by the memory of one state of the result. Fitted
+/// motion has up to about twelve pieces for each Gaussian, and an open file holds each piece twice.
 const WRITTEN_COPIES: u64 = 24;
 /// Number of views whose rendering is timed, on one thread.
 const TIMED_VIEWS: usize = 3;
@@ -159,8 +159,8 @@ impl QualityStage {
     }
 
     /// Opens the output that was written to `path`, as a copy in a scratch folder with the ending of its kind. Returns
-    /// `None` if it is not read back: see [`QualityStage::reads_no_output`], and a `.splatv` if the times of the frames
-    /// are not from 0 to 1, because the file then has scaled times.
+    /// `None` if it is not read back: see [`QualityStage::reads_no_output`]. A `.splatv` is not read back either if
+    /// frames have times outside the range from 0 to 1, because it then stores times that are scaled to this range.
     ///
     /// # Errors
     /// Fails if the output cannot be copied or read.
@@ -245,7 +245,7 @@ impl QualityStage {
             (None, Some(PreparedArchive::Frames(_))) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
-        let before_conversion = written.is_none() && !matches!(self.kind.fidelity(), Fidelity::Exact);
+        let before_conversion = written.is_none() && self.kind.fidelity() != Fidelity::Exact;
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
             let psnr = journal.result_psnr().unwrap_or(refined.result);
             let views = refined.views;

@@ -125,14 +125,14 @@ impl QualityTarget {
     }
 }
 
-/// Returns the squared error that quantization adds if it lowers the PSNR by `loss` dB, as a fraction of the squared
-/// error before quantization.
+/// Returns the squared error that quantization adds if it lowers the PSNR by `loss` dB. The unit is the squared error
+/// before quantization.
 pub(crate) fn error_from_loss(loss: f64) -> f64 {
     10f64.powf(0.1 * loss) - 1.0
 }
 
-/// Returns the loss of PSNR, dB, by the squared error `error` that quantization adds, as a fraction of the squared error
-/// before quantization. Inverse of [`error_from_loss`].
+/// Returns by how many dB quantization lowers the PSNR if it adds the squared error `error`. The unit of `error` is the
+/// squared error before quantization. Inverse of [`error_from_loss`].
 pub(crate) fn loss_from_error(error: f64) -> f64 {
     10.0 * (1.0 + error).log10()
 }

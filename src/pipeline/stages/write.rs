@@ -114,20 +114,20 @@ impl Stage for WriteStage {
         let input =
             run.input.take().ok_or_else(|| Error::internal("the input was not described before it was written"))?;
         let (merge, goal, archive) = (run.merge.take(), run.goal.take(), run.archive.take());
-        let measure = |path: &Path, journal: &mut Journal| match run.quality {
-            Some(quality) => Ok(Some(quality)),
-            None => run.stages.all().find_map(|stage| stage.measure_output(run, path, journal).transpose()).transpose(),
-        };
         let summarize = |path: &Path, mut journal: Journal, output: ModelSize| {
+            let mut measure = |stage: &dyn Stage| stage.measure_output(run, path, &mut journal).transpose();
+            let quality = match run.quality {
+                Some(quality) => Some(quality),
+                None => run.stages.all().find_map(&mut measure).transpose()?,
+            };
             Ok(Summary {
-                quality: measure(path, &mut journal)?,
                 schema: summary::SCHEMA,
                 files: Vec::new(),
                 tool: TOOL.to_owned(),
                 cameras: CameraSummary::from_scene(run.scene),
                 output: name_of(&self.output),
                 given_cameras: run.request.input.cameras.clone(),
-                is_readable: self.kind.fidelity() != Fidelity::Unreadable,
+                is_unreadable: self.kind.fidelity() == Fidelity::Unreadable,
                 gaussians: run.result.len(),
                 output_bytes: output.total(),
                 output_size: output,
@@ -140,6 +140,7 @@ impl Stage for WriteStage {
                 bands: journal.bands,
                 refined: journal.refined,
                 photographs: journal.photographs,
+                quality,
                 archive,
                 left_out: journal.left_out,
                 notes: journal.notes,
