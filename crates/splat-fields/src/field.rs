@@ -15,6 +15,7 @@ use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes, Gaussians};
 
 use super::deltas::Deltas;
+use super::instruction_set::{Evaluation, InstructionSet, run_on_best};
 use super::linear::{CacheLine, LANES, Linear};
 use super::planes::{Planes, PreparedPlanes, TimeLines};
 use super::tensors::{Lookup, Tensors};
@@ -285,50 +286,35 @@ impl Field {
         }
         let time = time as f32;
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: AVX2 and FMA were detected on the line above.
-            unsafe { self.evaluate_fma(prepared, time, &lines, scratch, out) };
-            return Ok(());
-        }
-        self.evaluate::<false>(prepared, time, &lines, scratch, out);
+        run_on_best(DeltaEvaluation { field: self, prepared, time, lines, scratch, out });
         Ok(())
     }
+}
 
-    /// Calls [`Field::evaluate`], compiled for the instruction sets AVX2 and FMA.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn evaluate_fma(
-        &self,
-        prepared: &PreparedPositions,
-        time: f32,
-        lines: &[TimeLines],
-        scratch: &mut LayerBuffers,
-        out: &mut Deltas,
-    ) {
-        self.evaluate::<true>(prepared, time, lines, scratch, out);
-    }
+/// Evaluation of [`Field::deltas`] at `time` into `out`. `lines` are the feature planes with a time axis, interpolated
+/// at this time; it is empty if the field has no planes.
+struct DeltaEvaluation<'a> {
+    field: &'a Field,
+    prepared: &'a PreparedPositions,
+    time: f32,
+    lines: Vec<TimeLines>,
+    scratch: &'a mut LayerBuffers,
+    out: &'a mut Deltas,
+}
 
-    /// Evaluates the field at `time` into `out`, in groups of [`LANES`] Gaussians. `lines` are the feature planes with
-    /// a time axis, interpolated at this time; it is empty if the field has no planes. The compiler inlines this
-    /// function and its callees into one copy per instruction set; `FMA` says whether fused multiply-adds are used.
+impl Evaluation for DeltaEvaluation<'_> {
+    /// Evaluates the field in groups of [`LANES`] Gaussians.
     #[inline(always)]
-    fn evaluate<const FMA: bool>(
-        &self,
-        prepared: &PreparedPositions,
-        time: f32,
-        lines: &[TimeLines],
-        scratch: &mut LayerBuffers,
-        out: &mut Deltas,
-    ) {
+    fn run<S: InstructionSet>(self) {
+        let DeltaEvaluation { field, prepared, time, lines, scratch, out } = self;
         let LayerBuffers { features, trunk, hidden } = scratch;
         for start in (0..prepared.rows).step_by(LANES) {
             let lanes = LANES.min(prepared.rows - start);
-            match (&self.planes, &prepared.input) {
+            match (&field.planes, &prepared.input) {
                 (Some(planes), PreparedInput::Planes(block)) => {
-                    planes.features(block, lines, start, lanes, features);
-                    if self.config.grid_pe > 1 {
-                        add_frequencies(features, self.config.grid_pe as f32);
+                    planes.features(block, &lines, start, lanes, features);
+                    if field.config.grid_pe > 1 {
+                        add_frequencies(features, field.config.grid_pe as f32);
                     }
                 }
                 (_, PreparedInput::Position(position)) => {
@@ -337,8 +323,8 @@ impl Field {
                 }
                 (None, PreparedInput::Planes(_)) => {}
             }
-            let trunk = run_trunk::<FMA>(&self.trunk, features, trunk);
-            for head in &self.heads {
+            let trunk = run_trunk::<S>(&field.trunk, features, trunk);
+            for head in &field.heads {
                 let (planes, len) = match (head.column, &mut out.mask) {
                     (Some(column), _) if out.active.contains(column) => {
                         let column = out.delta.attribute_values_mut(column);
@@ -348,8 +334,8 @@ impl Field {
                     (None, Some(mask)) => (mask.as_mut_slice(), prepared.rows),
                     _ => continue,
                 };
-                head.hidden.activate::<FMA>(trunk, hidden);
-                head.output.write::<FMA>(hidden, lanes, planes, len, start);
+                head.hidden.activate::<S>(trunk, hidden);
+                head.output.write::<S>(hidden, lanes, planes, len, start);
             }
         }
     }
@@ -370,14 +356,14 @@ pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features
 /// layer after ReLU, which every head (MLP of one attribute) reads. `last` and `spare` are buffers for the outputs of
 /// the layers; the returned slice is the content of `last`.
 #[inline(always)]
-fn run_trunk<'a, const FMA: bool>(
+fn run_trunk<'a, S: InstructionSet>(
     layers: &[Linear],
     input: &[CacheLine],
     [last, spare]: &'a mut [Vec<CacheLine>; 2],
 ) -> &'a [CacheLine] {
     for (i, layer) in layers.iter().enumerate() {
         std::mem::swap(last, spare);
-        layer.activate::<FMA>(if i == 0 { input } else { spare }, last);
+        layer.activate::<S>(if i == 0 { input } else { spare }, last);
     }
     last
 }

@@ -14,6 +14,7 @@ use super::deltas::{Deltas, finite};
 use super::field::{
     Field, Head, LayerBuffers, Mask, PreparedInput, PreparedPositions, add_frequencies, position_time_features,
 };
+use super::instruction_set::{Evaluation, InstructionSet, run_on_best};
 use super::linear::{CacheLine, LANES, Linear};
 use super::planes::{Planes, PreparedPlanes};
 use splat_core::error::{Error, Result};
@@ -100,41 +101,27 @@ impl Field {
             }
             _ => return Err(Error::internal("the block was prepared without slopes, or by another deformation field")),
         };
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: AVX2 and FMA were detected on the line above.
-            unsafe { self.position_jacobian_by_group_fma(head, position, planes, time, &mut out) };
-            return Ok(out);
-        }
-        self.position_jacobian_by_group::<false>(head, position, planes, time, &mut out);
+        run_on_best(PositionJacobian { field: self, head, position, planes, time, out: &mut out });
         Ok(out)
     }
+}
 
-    /// Calls [`Field::position_jacobian_by_group`], compiled for the instruction sets AVX2 and FMA.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn position_jacobian_by_group_fma(
-        &self,
-        head: &Head,
-        position: &AttributeValues,
-        planes: Option<(&Planes, &PreparedPlanes)>,
-        time: f32,
-        out: &mut AttributeValues,
-    ) {
-        self.position_jacobian_by_group::<true>(head, position, planes, time, out);
-    }
+/// Evaluation of [`Field::position_jacobian`] into `out`. `planes`: the feature planes with what was prepared for the
+/// positions; `None` if the field has no planes.
+struct PositionJacobian<'a> {
+    field: &'a Field,
+    head: &'a Head,
+    position: &'a AttributeValues,
+    planes: Option<(&'a Planes, &'a PreparedPlanes)>,
+    time: f32,
+    out: &'a mut AttributeValues,
+}
 
-    /// Computes the result of [`Field::position_jacobian`] into `out`, in groups of [`LANES`] Gaussians. The compiler
-    /// inlines this function and its callees into one copy per instruction set.
+impl Evaluation for PositionJacobian<'_> {
+    /// Computes the derivatives in groups of [`LANES`] Gaussians.
     #[inline(always)]
-    fn position_jacobian_by_group<const FMA: bool>(
-        &self,
-        head: &Head,
-        position: &AttributeValues,
-        planes: Option<(&Planes, &PreparedPlanes)>,
-        time: f32,
-        out: &mut AttributeValues,
-    ) {
+    fn run<S: InstructionSet>(self) {
+        let PositionJacobian { field, head, position, planes, time, out } = self;
         let lines = planes.map_or(Vec::new(), |(planes, _)| planes.lines(time));
         let mut group = JacobianGroup::default();
         for start in (0..position.len()).step_by(LANES) {
@@ -147,18 +134,18 @@ impl Field {
                 }
                 None => position_time_features(positions, time, features),
             }
-            if planes.is_some() && self.config.grid_pe > 1 {
-                add_frequencies(&mut group.features, self.config.grid_pe as f32);
+            if planes.is_some() && field.config.grid_pe > 1 {
+                add_frequencies(&mut group.features, field.config.grid_pe as f32);
             }
-            group.forward::<FMA>(self, head);
+            group.forward::<S>(field, head);
 
             for component in 0..3 {
                 group.gradient.clear();
                 group.gradient.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
                 group.gradient[component] = CacheLine([1.0; LANES]);
-                group.backward::<FMA>(self, head);
-                if planes.is_some() && self.config.grid_pe > 1 {
-                    frequencies_backward(&group.features, self.config.grid_pe as f32, &mut group.gradient);
+                group.backward::<S>(field, head);
+                if planes.is_some() && field.config.grid_pe > 1 {
+                    frequencies_backward(&group.features, field.config.grid_pe as f32, &mut group.gradient);
                 }
                 for axis in 0..3 {
                     let through_delta = match planes {
@@ -178,14 +165,14 @@ impl JacobianGroup {
     /// Evaluates the trunk (MLP shared by all attributes) and the hidden layer of `head` for the plane features of the
     /// group, and keeps the outputs of all layers for the backward pass.
     #[inline(always)]
-    fn forward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
+    fn forward<S: InstructionSet>(&mut self, field: &Field, head: &Head) {
         self.trunk.resize(field.trunk.len(), Vec::new());
         let mut input = &self.features;
         for (layer, out) in field.trunk.iter().zip(&mut self.trunk) {
-            layer.activate::<FMA>(input, out);
+            layer.activate::<S>(input, out);
             input = out;
         }
-        head.hidden.activate::<FMA>(input, &mut self.hidden);
+        head.hidden.activate::<S>(input, &mut self.hidden);
     }
 
     /// Returns the derivative of a position component with respect to the position along `axis`. By the chain rule,
@@ -205,10 +192,10 @@ impl JacobianGroup {
     /// features, by a backward pass through the head (MLP of the position) and the trunk (MLP shared by all
     /// attributes).
     #[inline(always)]
-    fn backward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
+    fn backward<S: InstructionSet>(&mut self, field: &Field, head: &Head) {
         let JacobianGroup { trunk, hidden, gradient, spare, .. } = self;
         let mut step = |layer: &Linear, activations: Option<&[CacheLine]>| {
-            layer.backward::<FMA>(gradient, activations, spare);
+            layer.backward::<S>(gradient, activations, spare);
             std::mem::swap(gradient, spare);
         };
         step(&head.output, Some(hidden));

@@ -30,6 +30,7 @@
 
 mod deltas;
 mod field;
+mod instruction_set;
 mod jacobian;
 mod linear;
 mod network;

@@ -1,13 +1,14 @@
 //! Fully connected layers, evaluated for [`LANES`] Gaussians side by side.
 //!
 //! On loading, weights are reordered into panels of four outputs each. The sums of a panel (four outputs of [`LANES`]
-//! Gaussians) take eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds. The lanes of a
-//! register belong to different Gaussians, not to different outputs, so layers with few outputs are not slower per
-//! output. A matrix library that reorders its operands in every call would spend a seventh of its time on this
+//! Gaussians) take eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds; with AVX-512,
+//! the sums of four panels take sixteen of 32 registers. The lanes of a register belong to different Gaussians, not to
+//! different outputs, so layers with few outputs are not slower per output. A matrix library that reorders its operands in every call would spend a seventh of its time on this
 //! reordering, because these matrices are small.
 
 use splat_core::error::Result;
 
+use super::instruction_set::InstructionSet;
 use super::tensors::Lookup;
 
 /// Number of Gaussians that are evaluated side by side, one per lane of the vectors.
@@ -20,6 +21,9 @@ pub(super) struct CacheLine(pub(super) [f32; LANES]);
 
 /// Number of outputs of a layer whose sums are computed together (a panel).
 const PANEL: usize = 4;
+
+/// Number of panels whose sums are computed together if the processor has AVX-512.
+const WIDE: usize = 4;
 
 /// Fully connected layer `y = W·x + b` with inputs x and outputs y.
 #[derive(Debug, Clone)]
@@ -72,17 +76,70 @@ impl Linear {
     /// Computes the outputs of the layer after ReLU for `input` `[inputs, LANES]`, into `out` `[outputs, LANES]`. A NaN
     /// stays NaN, unlike with `f32::max`.
     #[inline(always)]
-    pub(super) fn activate<const FMA: bool>(&self, input: &[CacheLine], out: &mut Vec<CacheLine>) {
+    pub(super) fn activate<S: InstructionSet>(&self, input: &[CacheLine], out: &mut Vec<CacheLine>) {
         out.resize(self.padded_outputs(), CacheLine([0.0; LANES]));
-        let panels = self.weight.chunks_exact(self.inputs).zip(&self.bias);
-        for (out, (weight, bias)) in out.chunks_exact_mut(PANEL).zip(panels) {
-            let sums = panel_outputs::<FMA>(input, weight, bias);
-            for (out, y) in out.iter_mut().zip(&sums) {
-                for (out, &y) in out.0.iter_mut().zip(&y.0) {
-                    *out = if y < 0.0 { 0.0 } else { y };
+        self.for_each_output::<S>(input, |o, y| {
+            for (out, &y) in out[o].0.iter_mut().zip(&y.0) {
+                *out = if y < 0.0 { 0.0 } else { y };
+            }
+        });
+    }
+
+    /// Computes the outputs of the layer for `input`, without ReLU, and writes the outputs of the first `lanes`
+    /// Gaussians to `planes`. `planes` holds one plane of `len` values per output. Output o of the first Gaussian is
+    /// written to index `o·len + start`, and the outputs o of the next Gaussians follow.
+    #[inline(always)]
+    pub(super) fn write<S: InstructionSet>(
+        &self,
+        input: &[CacheLine],
+        lanes: usize,
+        planes: &mut [f32],
+        len: usize,
+        start: usize,
+    ) {
+        self.for_each_output::<S>(input, |o, y| {
+            if o < self.outputs {
+                planes[o * len + start..][..lanes].copy_from_slice(&y.0[..lanes]);
+            }
+        });
+    }
+
+    /// Calls `take` with the index of every output and its values before ReLU for `input` `[inputs, LANES]`. Includes
+    /// the outputs that fill up the last panel.
+    #[inline(always)]
+    fn for_each_output<S: InstructionSet>(&self, input: &[CacheLine], mut take: impl FnMut(usize, &CacheLine)) {
+        let input = &input[..self.inputs];
+        let wide = if S::IS_WIDE { self.bias.len() / WIDE * WIDE } else { 0 };
+        for panel in (0..wide).step_by(WIDE) {
+            let sums = self.panel_outputs::<S, WIDE>(input, panel);
+            sums.as_flattened().iter().enumerate().for_each(|(o, sum)| take(PANEL * panel + o, sum));
+        }
+        for panel in wide..self.bias.len() {
+            let sums = self.panel_outputs::<S, 1>(input, panel);
+            sums.as_flattened().iter().enumerate().for_each(|(o, sum)| take(PANEL * panel + o, sum));
+        }
+    }
+
+    /// Computes the outputs of the `N` panels from `panel` on, before ReLU, for `input` `[inputs, LANES]`.
+    ///
+    /// Each output is the bias plus the products of inputs and weights, added in the order of the inputs. The result
+    /// for a Gaussian therefore depends neither on the Gaussians beside it nor on `N`.
+    #[inline(always)]
+    fn panel_outputs<S: InstructionSet, const N: usize>(
+        &self,
+        input: &[CacheLine],
+        panel: usize,
+    ) -> [[CacheLine; PANEL]; N] {
+        let mut sums: [_; N] = std::array::from_fn(|p| self.bias[panel + p].map(|b| CacheLine([b; LANES])));
+        let weights: [_; N] = std::array::from_fn(|p| &self.weight[(panel + p) * self.inputs..][..input.len()]);
+        for (i, x) in input.iter().enumerate() {
+            for (sums, weight) in sums.iter_mut().zip(&weights) {
+                for (sum, &w) in sums.iter_mut().zip(&weight[i]) {
+                    S::add_product(sum, x, w);
                 }
             }
         }
+        sums
     }
 
     /// Computes the backward pass of the layer: converts derivatives of a value with respect to the outputs
@@ -92,25 +149,22 @@ impl Linear {
     /// `activations` holds the inputs of the layer if they come out of a ReLU, and is `None` if not. With it, the
     /// derivative is continued through the ReLU: it becomes 0 for an input that is not positive.
     #[inline(always)]
-    pub(super) fn backward<const FMA: bool>(
+    pub(super) fn backward<S: InstructionSet>(
         &self,
         output_gradient: &[CacheLine],
         activations: Option<&[CacheLine]>,
         out: &mut Vec<CacheLine>,
     ) {
         out.resize(self.inputs.next_multiple_of(PANEL), CacheLine([0.0; LANES]));
-        for (first, out) in (0..self.inputs).step_by(PANEL).zip(out.chunks_exact_mut(PANEL)) {
-            let mut sums = [CacheLine([0.0; LANES]); PANEL];
-            for (weight, gradient) in self.weight.chunks_exact(self.inputs).zip(output_gradient.chunks_exact(PANEL)) {
-                for (sum, weight) in sums.iter_mut().zip(&weight[first..]) {
-                    for (&w, gradient) in weight.iter().zip(gradient) {
-                        for (sum, &gradient) in sum.0.iter_mut().zip(&gradient.0) {
-                            *sum = if FMA { gradient.mul_add(w, *sum) } else { gradient * w + *sum };
-                        }
-                    }
-                }
-            }
-            out.copy_from_slice(&sums);
+        let together = PANEL * WIDE;
+        let wide = if S::IS_WIDE { self.inputs / together * together } else { 0 };
+        for first in (0..wide).step_by(together) {
+            let sums = self.input_gradients::<S, { PANEL * WIDE }>(output_gradient, first);
+            out[first..][..together].copy_from_slice(&sums);
+        }
+        for first in (wide..self.inputs).step_by(PANEL) {
+            let sums = self.input_gradients::<S, PANEL>(output_gradient, first);
+            out[first..][..PANEL].copy_from_slice(&sums);
         }
         for (out, activations) in out.iter_mut().zip(activations.unwrap_or_default()) {
             for (out, &activation) in out.0.iter_mut().zip(&activations.0) {
@@ -119,48 +173,105 @@ impl Linear {
         }
     }
 
-    /// Computes the outputs of the layer for `input`, without ReLU, and writes the outputs of the first `lanes`
-    /// Gaussians to `planes`. `planes` holds one plane of `len` values per output. Output o of the first Gaussian is
-    /// written to index `o·len + start`, and the outputs o of the next Gaussians follow.
+    /// Computes the derivatives with respect to the `N` inputs from `first` on, for the derivatives `output_gradient`
+    /// with respect to the outputs. Inputs after the last one have the derivative 0.
     #[inline(always)]
-    pub(super) fn write<const FMA: bool>(
+    fn input_gradients<S: InstructionSet, const N: usize>(
         &self,
-        input: &[CacheLine],
-        lanes: usize,
-        planes: &mut [f32],
-        len: usize,
-        start: usize,
-    ) {
-        let panels = self.weight.chunks_exact(self.inputs).zip(&self.bias);
-        for (panel, (weight, bias)) in panels.enumerate() {
-            let first = panel * PANEL;
-            let sums = panel_outputs::<FMA>(input, weight, bias);
-            for (o, y) in (first..self.outputs).zip(&sums) {
-                planes[o * len + start..][..lanes].copy_from_slice(&y.0[..lanes]);
+        output_gradient: &[CacheLine],
+        first: usize,
+    ) -> [CacheLine; N] {
+        let mut sums = [CacheLine([0.0; LANES]); N];
+        for (weight, gradient) in self.weight.chunks_exact(self.inputs).zip(output_gradient.chunks_exact(PANEL)) {
+            let mut padded = [[0.0; PANEL]; N];
+            let weight = match weight[first..].first_chunk::<N>() {
+                Some(weight) => weight,
+                None => {
+                    padded[..self.inputs - first].copy_from_slice(&weight[first..]);
+                    &padded
+                }
+            };
+            for (o, gradient) in gradient.iter().enumerate() {
+                for (sum, weight) in sums.iter_mut().zip(weight) {
+                    S::add_product(sum, gradient, weight[o]);
+                }
             }
         }
+        sums
     }
 }
 
-/// Computes the outputs of one panel ([`PANEL`] outputs) of a layer from the `input` of the layer, and the `weight` and
-/// `bias` of the panel.
-///
-/// Each output is the bias plus the products of inputs and weights, added in the order of the inputs. The result for a
-/// Gaussian therefore does not depend on the Gaussians beside it. `FMA` selects fused multiply-adds. On a processor
-/// without these instructions, each fused multiply-add would be a function call.
-#[inline(always)]
-fn panel_outputs<const FMA: bool>(
-    input: &[CacheLine],
-    weight: &[[f32; PANEL]],
-    bias: &[f32; PANEL],
-) -> [CacheLine; PANEL] {
-    let mut sums = bias.map(|b| CacheLine([b; LANES]));
-    for (x, weight) in input.iter().zip(weight) {
-        for (sums, &w) in sums.iter_mut().zip(weight) {
-            for (sum, &x) in sums.0.iter_mut().zip(&x.0) {
-                *sum = if FMA { x.mul_add(w, *sum) } else { x * w + *sum };
+#[cfg(test)]
+mod tests {
+    use super::super::instruction_set::{InstructionSet, Portable};
+    use super::*;
+    use crate::synthetic::Noise;
+
+    /// Returns a layer with random weights.
+    fn layer(inputs: usize, outputs: usize) -> Linear {
+        let mut noise = Noise(7);
+        let mut weight = vec![[0.0; PANEL]; outputs.div_ceil(PANEL) * inputs];
+        let mut bias = vec![[0.0; PANEL]; outputs.div_ceil(PANEL)];
+        for o in 0..outputs {
+            bias[o / PANEL][o % PANEL] = noise.next();
+            (0..inputs).for_each(|i| weight[o / PANEL * inputs + i][o % PANEL] = noise.next());
+        }
+        Linear { weight, bias, inputs, outputs }
+    }
+
+    fn random_lines(count: usize) -> Vec<CacheLine> {
+        let mut noise = Noise(8);
+        (0..count).map(|_| CacheLine(std::array::from_fn(|_| noise.next()))).collect()
+    }
+
+    /// Returns the outputs of `layer` for random inputs, and the gradients of the inputs for random gradients of the
+    /// outputs, computed with the instruction set `S`.
+    fn outputs_and_gradients<S: InstructionSet>(layer: &Linear) -> [Vec<[f32; LANES]>; 2] {
+        let (mut outputs, mut gradients) = (Vec::new(), Vec::new());
+        layer.activate::<S>(&random_lines(layer.inputs), &mut outputs);
+        let mut output_gradients = random_lines(layer.outputs);
+        output_gradients.resize(layer.padded_outputs(), CacheLine([0.0; LANES]));
+        layer.backward::<S>(&output_gradients, None, &mut gradients);
+        outputs.truncate(layer.outputs);
+        gradients.truncate(layer.inputs);
+        [outputs, gradients].map(|lines| lines.into_iter().map(|line| line.0).collect())
+    }
+
+    /// Sizes of layers, as (inputs, outputs): with and without panels and inputs left over beside wide groups.
+    const SIZES: [(usize, usize); 5] = [(1, 1), (5, 3), (16, 16), (37, 48), (64, 67)];
+
+    #[test]
+    fn layers_match_sums_in_f64() {
+        for (inputs, outputs) in SIZES {
+            let layer = layer(inputs, outputs);
+            let [found, gradients] = outputs_and_gradients::<Portable>(&layer);
+            let (x, by_y) = (random_lines(inputs), random_lines(outputs));
+            let weight = |o: usize, i: usize| f64::from(layer.weight[o / PANEL * inputs + i][o % PANEL]);
+            for lane in 0..LANES {
+                let value = |lines: &[CacheLine], k: usize| f64::from(lines[k].0[lane]);
+                for (o, found) in found.iter().enumerate() {
+                    let sum: f64 = (0..inputs).map(|i| weight(o, i) * value(&x, i)).sum();
+                    let expected = (sum + f64::from(layer.bias[o / PANEL][o % PANEL])).max(0.0);
+                    assert!((f64::from(found[lane]) - expected).abs() < 1e-5, "{inputs}, {outputs}: output {o}");
+                }
+                for (i, gradient) in gradients.iter().enumerate() {
+                    let expected: f64 = (0..outputs).map(|o| weight(o, i) * value(&by_y, o)).sum();
+                    assert!((f64::from(gradient[lane]) - expected).abs() < 1e-5, "{inputs}, {outputs}: input {i}");
+                }
             }
         }
     }
-    sums
+
+    #[cfg(target_arch = "x86_64")]
+    #[test]
+    fn avx512_gives_the_bits_of_avx2() {
+        use super::super::instruction_set::{Avx2, Avx512};
+        if !is_x86_feature_detected!("avx512f") {
+            return;
+        }
+        for (inputs, outputs) in SIZES {
+            let layer = layer(inputs, outputs);
+            assert_eq!(outputs_and_gradients::<Avx512>(&layer), outputs_and_gradients::<Avx2>(&layer));
+        }
+    }
 }

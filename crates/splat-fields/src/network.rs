@@ -15,6 +15,7 @@
 
 use std::path::Path;
 
+use super::instruction_set::{Evaluation, InstructionSet, run_on_best};
 use super::linear::{CacheLine, LANES, Linear};
 use super::tensors::{Lookup, Tensors};
 use splat_core::error::{Error, Result};
@@ -260,13 +261,7 @@ impl Network {
             }
             column.resize(encoded.rows);
         }
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: AVX2 and FMA were detected on the line above.
-            unsafe { self.evaluate_fma(encoded, time, want, out) };
-            return Ok(());
-        }
-        self.evaluate::<false>(encoded, time, want, out);
+        run_on_best(MotionEvaluation { network: self, encoded, time, want, out });
         Ok(())
     }
 
@@ -280,117 +275,111 @@ impl Network {
         let encoded = self.encode(position);
         let outputs = if self.predicts_screw_motion() { 6 } else { 3 };
         let mut out = AttributeValues::zeros(3 * outputs, encoded.rows);
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: AVX2 and FMA were detected on the line above.
-            unsafe { self.differentiate_fma(&encoded, time, &mut out) };
-            return Ok(out);
-        }
-        self.differentiate::<false>(&encoded, time, &mut out);
+        run_on_best(WarpJacobian { network: self, encoded: &encoded, time, out: &mut out });
         Ok(out)
-    }
-
-    /// Calls [`Network::evaluate`], compiled for the instruction sets AVX2 and FMA.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn evaluate_fma(&self, encoded: &EncodedPositions, time: f32, want: Attributes, out: &mut PredictedMotion) {
-        self.evaluate::<true>(encoded, time, want, out);
-    }
-
-    /// Calls [`Network::differentiate`], compiled for the instruction sets AVX2 and FMA.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn differentiate_fma(&self, encoded: &EncodedPositions, time: f32, out: &mut AttributeValues) {
-        self.differentiate::<true>(encoded, time, out);
-    }
-
-    /// Computes the motion of the attributes `want` at `time` into `out`, from the encoded positions `encoded`. The
-    /// compiler inlines this function and its callees into one copy per instruction set; `FMA` says whether fused
-    /// multiply-adds are used.
-    #[inline(always)]
-    fn evaluate<const FMA: bool>(
-        &self,
-        encoded: &EncodedPositions,
-        time: f32,
-        want: Attributes,
-        out: &mut PredictedMotion,
-    ) {
-        let (encoded_time, mut scratch) = (self.encode_time::<FMA>(time), NetworkScratch::default());
-        for (group, position_encoding) in encoded.values.chunks_exact(POSITION_INPUTS).enumerate() {
-            let NetworkScratch { input, last, spare } = &mut scratch;
-            input.clear();
-            input.extend_from_slice(position_encoding);
-            input.extend_from_slice(&encoded_time);
-            for (k, layer) in self.layers.iter().enumerate() {
-                std::mem::swap(last, spare);
-                if layer.has_skip {
-                    input.truncate(POSITION_INPUTS + encoded_time.len());
-                    input.extend_from_slice(&spare[..self.layers[k - 1].linear.outputs]);
-                }
-                layer.linear.activate::<FMA>(if k == 0 || layer.has_skip { input } else { spare }, last);
-            }
-            let start = group * LANES;
-            let lanes = LANES.min(encoded.rows - start);
-            for head in self.heads.iter().filter(|head| want.contains(head.column)) {
-                let planes = &mut out.column_mut(head.column).planes_mut()[head.plane * encoded.rows..];
-                head.output.write::<FMA>(last, lanes, planes, encoded.rows, start);
-            }
-        }
     }
 
     /// Returns the encoding of `time` that the layers read: the time with its sines and cosines, or the output of the
     /// time network if there is one. All Gaussians of a group get the same values.
     #[inline(always)]
-    fn encode_time<const FMA: bool>(&self, time: f32) -> Vec<CacheLine> {
+    fn encode_time<S: InstructionSet>(&self, time: f32) -> Vec<CacheLine> {
         let mut now: Vec<CacheLine> =
             encode_scalar(time, self.octaves).into_iter().map(|value| CacheLine([value; LANES])).collect();
         if let Some([first, last]) = &self.time {
             let (mut hidden, mut planes) = (Vec::new(), vec![0.0; last.outputs]);
-            first.activate::<FMA>(&now, &mut hidden);
-            last.write::<FMA>(&hidden, 1, &mut planes, 1, 0);
+            first.activate::<S>(&now, &mut hidden);
+            last.write::<S>(&hidden, 1, &mut planes, 1, 0);
             now = planes.into_iter().map(|value| CacheLine([value; LANES])).collect();
         }
         now
     }
+}
 
-    /// Computes into `out` the derivatives of the position outputs (offset, or parameters of the screw motion) with
-    /// respect to the stored position, at `time`. Makes one forward pass for all outputs, and one backward pass for
-    /// each output.
+/// Evaluation of [`Network::motion`] at `time` into `out`, for the heads of the attributes `want`.
+struct MotionEvaluation<'a> {
+    network: &'a Network,
+    encoded: &'a EncodedPositions,
+    time: f32,
+    want: Attributes,
+    out: &'a mut PredictedMotion,
+}
+
+impl Evaluation for MotionEvaluation<'_> {
+    /// Evaluates the network in groups of [`LANES`] Gaussians.
     #[inline(always)]
-    fn differentiate<const FMA: bool>(&self, encoded: &EncodedPositions, time: f32, out: &mut AttributeValues) {
-        let encoded_time = self.encode_time::<FMA>(time);
+    fn run<S: InstructionSet>(self) {
+        let MotionEvaluation { network, encoded, time, want, out } = self;
+        let (encoded_time, mut scratch) = (network.encode_time::<S>(time), NetworkScratch::default());
+        for (group, position_encoding) in encoded.values.chunks_exact(POSITION_INPUTS).enumerate() {
+            let NetworkScratch { input, last, spare } = &mut scratch;
+            input.clear();
+            input.extend_from_slice(position_encoding);
+            input.extend_from_slice(&encoded_time);
+            for (k, layer) in network.layers.iter().enumerate() {
+                std::mem::swap(last, spare);
+                if layer.has_skip {
+                    input.truncate(POSITION_INPUTS + encoded_time.len());
+                    input.extend_from_slice(&spare[..network.layers[k - 1].linear.outputs]);
+                }
+                layer.linear.activate::<S>(if k == 0 || layer.has_skip { input } else { spare }, last);
+            }
+            let start = group * LANES;
+            let lanes = LANES.min(encoded.rows - start);
+            for head in network.heads.iter().filter(|head| want.contains(head.column)) {
+                let planes = &mut out.column_mut(head.column).planes_mut()[head.plane * encoded.rows..];
+                head.output.write::<S>(last, lanes, planes, encoded.rows, start);
+            }
+        }
+    }
+}
+
+/// Evaluation of [`Network::warp_jacobian`] at `time` into `out`.
+struct WarpJacobian<'a> {
+    network: &'a Network,
+    encoded: &'a EncodedPositions,
+    time: f32,
+    out: &'a mut AttributeValues,
+}
+
+impl Evaluation for WarpJacobian<'_> {
+    /// Makes, for each group of [`LANES`] Gaussians, one forward pass for all outputs, and one backward pass for each
+    /// position output (offset, or parameters of the screw motion).
+    #[inline(always)]
+    fn run<S: InstructionSet>(self) {
+        let WarpJacobian { network, encoded, time, out } = self;
+        let encoded_time = network.encode_time::<S>(time);
         let encodings = POSITION_INPUTS + encoded_time.len();
-        let mut activations: Vec<Vec<CacheLine>> = vec![Vec::new(); self.layers.len()];
+        let mut activations: Vec<Vec<CacheLine>> = vec![Vec::new(); network.layers.len()];
         let (mut input, mut gradient, mut spare, mut position_gradient) =
             (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for (group, position_encoding) in encoded.values.chunks_exact(POSITION_INPUTS).enumerate() {
             input.clear();
             input.extend_from_slice(position_encoding);
             input.extend_from_slice(&encoded_time);
-            for (k, layer) in self.layers.iter().enumerate() {
+            for (k, layer) in network.layers.iter().enumerate() {
                 let (before, now) = activations.split_at_mut(k);
                 let before = before.last().map_or(&[][..], |before| &before[..]);
                 if layer.has_skip {
                     input.truncate(encodings);
-                    input.extend_from_slice(&before[..self.layers[k - 1].linear.outputs]);
+                    input.extend_from_slice(&before[..network.layers[k - 1].linear.outputs]);
                 }
-                layer.linear.activate::<FMA>(if k == 0 || layer.has_skip { &input } else { before }, &mut now[0]);
+                layer.linear.activate::<S>(if k == 0 || layer.has_skip { &input } else { before }, &mut now[0]);
             }
             let start = group * LANES;
             let lanes = LANES.min(encoded.rows - start);
-            let heads = self.heads.iter().filter(|head| head.column == Attributes::POSITION);
+            let heads = network.heads.iter().filter(|head| head.column == Attributes::POSITION);
             for (head, component) in heads.flat_map(|head| (0..head.output.outputs).map(move |o| (head, o))) {
                 gradient.clear();
                 gradient.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
                 gradient[component] = CacheLine([1.0; LANES]);
                 position_gradient.clear();
                 position_gradient.resize(POSITION_INPUTS, CacheLine([0.0; LANES]));
-                head.output.backward::<FMA>(&gradient, activations.last().map(Vec::as_slice), &mut spare);
+                head.output.backward::<S>(&gradient, activations.last().map(Vec::as_slice), &mut spare);
                 std::mem::swap(&mut gradient, &mut spare);
-                for (k, layer) in self.layers.iter().enumerate().rev() {
+                for (k, layer) in network.layers.iter().enumerate().rev() {
                     // A layer with a skip connection first reads the encodings, which do not come out of a ReLU.
                     let before = k.checked_sub(1).map(|before| &activations[before][..]);
-                    layer.linear.backward::<FMA>(&gradient, before.filter(|_| !layer.has_skip), &mut spare);
+                    layer.linear.backward::<S>(&gradient, before.filter(|_| !layer.has_skip), &mut spare);
                     std::mem::swap(&mut gradient, &mut spare);
                     if k == 0 || layer.has_skip {
                         add_to_sums(&gradient[..POSITION_INPUTS], &mut position_gradient);

@@ -10,8 +10,8 @@
 //! Gaussians. All Gaussians share the time of a frame, so each plane with time is first interpolated along time into a
 //! line. A Gaussian then interpolates between two points of that line.
 
-use splat_core::AttributeValues;
 use splat_core::error::Result;
+use splat_core::{AttributeValues, vectorized};
 
 use super::linear::{CacheLine, LANES};
 use super::tensors::Lookup;
@@ -241,20 +241,10 @@ impl Planes {
     /// Computes the time-independent part of the features ([`PreparedPlanes`]) of Gaussians at the stored positions
     /// `position` (`[3, N]`).
     pub(super) fn prepare(&self, position: &AttributeValues) -> PreparedPlanes {
-        #[cfg(target_arch = "x86_64")]
-        {
-            /// Calls [`Planes::prepare_rows`], compiled for AVX2. Multiply-adds are not fused, so results have
-            /// the same bits as without AVX2.
-            #[target_feature(enable = "avx2")]
-            fn prepare_avx2(planes: &Planes, position: &AttributeValues) -> PreparedPlanes {
-                planes.prepare_rows(position)
-            }
-            if is_x86_feature_detected!("avx2") {
-                // SAFETY: AVX2 was detected on the line above.
-                return unsafe { prepare_avx2(self, position) };
-            }
-        }
-        self.prepare_rows(position)
+        vectorized(
+            #[inline(always)]
+            || self.prepare_rows(position),
+        )
     }
 
     /// Computes the result of [`Planes::prepare`]. The compiler inlines this function into one copy per instruction
