@@ -8,6 +8,7 @@ use std::ops::Range;
 
 use super::windows::Windows;
 use crate::model::exp_log::{exp, ln};
+use crate::model::vectorized;
 
 /// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 pub(super) const MAX_OPACITY: f64 = 0.999;
@@ -66,21 +67,10 @@ pub(super) fn estimate_depths(windows: &Windows, track_depths: &[f64]) -> Vec<f6
 /// of all curves add up to `track_depths`, the depth of the Gaussian at each frame, as closely as the iterations reach.
 /// Ends after `max_updates` iterations at the latest.
 pub(super) fn refine_depths(windows: &Windows, track_depths: &[f64], depths: &mut [f64], max_updates: usize) {
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        // SAFETY: the line above saw that this processor has AVX2.
-        unsafe { iterate_avx2(windows, track_depths, depths, max_updates) };
-        return;
-    }
-    iterate(windows, track_depths, depths, max_updates);
-}
-
-/// Does the same as [`iterate`], with the same operations, but compiled for AVX2, which processes four frames at a
-/// time.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn iterate_avx2(windows: &Windows, track_depths: &[f64], depths: &mut [f64], max_updates: usize) {
-    iterate(windows, track_depths, depths, max_updates);
+    vectorized(
+        #[inline(always)]
+        || iterate(windows, track_depths, depths, max_updates),
+    );
 }
 
 /// Runs the iterations of [`refine_depths`].
@@ -157,20 +147,16 @@ mod tests {
         }
     }
 
-    #[cfg(target_arch = "x86_64")]
     #[test]
-    #[ignore = "needs AVX2"]
-    fn avx2_gives_the_bits_of_the_baseline() {
-        assert!(std::arch::is_x86_feature_detected!("avx2"), "this processor has no AVX2");
+    fn vector_instructions_give_the_bits_of_the_baseline() {
         for count in [1, 3, 16] {
             let windows = even_windows(count);
             let target: Vec<f64> = (0..60).map(|frame| depth(f64::from(frame) / 59.0)).collect();
             let mut baseline = estimate_depths(&windows, &target);
-            let mut vectorized = baseline.clone();
+            let mut wide = baseline.clone();
             iterate(&windows, &target, &mut baseline, 20);
-            // SAFETY: the first line saw that this processor has AVX2.
-            unsafe { iterate_avx2(&windows, &target, &mut vectorized, 20) };
-            assert_eq!(baseline, vectorized);
+            refine_depths(&windows, &target, &mut wide, 20);
+            assert_eq!(baseline, wide);
         }
     }
 }

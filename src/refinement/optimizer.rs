@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::compressed_model::ParamDelta;
-use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, sh_coefficient_count};
+use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, sh_coefficient_count, vectorized};
 
 /// Adam's decay rates β₁, of the running mean of the derivative, and β₂, of the running mean of its square.
 const BETAS: [f32; 2] = [0.9, 0.999];
@@ -153,14 +153,19 @@ impl Adam {
         }
         planes.into_par_iter().for_each(|(rate, reach, (((mean, square), value), slope))| {
             let state = mean.iter_mut().zip(square).zip(value).zip(slope).zip(reach);
-            for ((((mean, square), value), &slope), &reach) in state {
-                let slope = weight * slope;
-                *mean += (1.0 - BETAS[0]) * (slope - *mean);
-                *square += (1.0 - BETAS[1]) * (slope * slope - *square);
-                let root = (*square * unbiased[1]).sqrt() + EPSILON;
-                let next = *value - rate * reach * (*mean * unbiased[0]) / root;
-                *value = if next.is_finite() { next } else { *value };
-            }
+            vectorized(
+                #[inline(always)]
+                || {
+                    for ((((mean, square), value), &slope), &reach) in state {
+                        let slope = weight * slope;
+                        *mean += (1.0 - BETAS[0]) * (slope - *mean);
+                        *square += (1.0 - BETAS[1]) * (slope * slope - *square);
+                        let root = (*square * unbiased[1]).sqrt() + EPSILON;
+                        let next = *value - rate * reach * (*mean * unbiased[0]) / root;
+                        *value = if next.is_finite() { next } else { *value };
+                    }
+                },
+            );
         });
     }
 }

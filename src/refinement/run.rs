@@ -337,7 +337,8 @@ impl<'a> RefineRun<'a> {
     }
 
     fn step(&mut self, optimizer: &mut OptimizerState<'_>, schedule: &RateSchedule) -> Result<()> {
-        optimizer.step(self.sampler.next(), schedule)?;
+        let view = self.sampler.next();
+        rayon::scope(|_| optimizer.step(view, schedule))?;
         self.progress.advance(1);
         Ok(())
     }

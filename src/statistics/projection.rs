@@ -17,7 +17,7 @@
 
 use std::f64::consts::FRAC_PI_4;
 
-use crate::model::Camera;
+use crate::model::{Camera, vectorized};
 
 /// Limit for |x/z| and |y/z| in the Jacobian, as a multiple of the tangent of half the field of view.
 const JACOBIAN_CLAMP: f64 = 1.3;
@@ -76,21 +76,10 @@ pub struct CoverageScale {
 /// Panics if the arrays of `planes` and `sums` differ in length.
 pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let view = ScanView::new(camera);
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        // SAFETY: the line above saw that this processor has AVX2.
-        unsafe { project_avx2(&view, planes, scale, sums) };
-        return;
-    }
-    project_planes(&view, planes, scale, sums);
-}
-
-/// Does the same as [`project_planes`], with the same operations, but compiled for AVX2, which processes four Gaussians
-/// at a time.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
-    project_planes(view, planes, scale, sums);
+    vectorized(
+        #[inline(always)]
+        || project_planes(&view, planes, scale, sums),
+    );
 }
 
 /// Camera parameters in the form that the inner loop of the projection uses.
@@ -333,13 +322,13 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "needs AVX2"]
-    #[cfg(target_arch = "x86_64")]
-    fn avx2_gives_the_bits_of_the_baseline() {
-        assert!(std::arch::is_x86_feature_detected!("avx2"), "this processor has no AVX2");
-        // SAFETY: the line above saw that this processor has AVX2.
-        let wide =
-            run_on_random_gaussians(|view, planes, scale, sums| unsafe { project_avx2(view, planes, scale, sums) });
+    fn vector_instructions_give_the_bits_of_the_baseline() {
+        let wide = run_on_random_gaussians(|view, planes, scale, sums| {
+            vectorized(
+                #[inline(always)]
+                || project_planes(view, planes, scale, sums),
+            );
+        });
         let baseline = run_on_random_gaussians(project_planes);
         assert!(baseline.1.iter().filter(|&&touched| touched > 0).count() > 200, "the case must see something");
         assert_eq!(wide, baseline);

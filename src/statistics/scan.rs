@@ -8,7 +8,7 @@ use super::motion::MotionSums;
 use super::plan::{PAIRS_PER_CARRY, ScanPlan};
 use super::projection::{CoverageScale, CoverageSums, FootprintPlanes, project};
 use super::state::{BlockState, CHUNK};
-use crate::model::{AnomalyFlags, Attributes, Camera, Gaussians, StatisticRows};
+use crate::model::{AnomalyFlags, Attributes, Camera, Gaussians, StatisticRows, vectorized};
 
 /// Bytes of memory that a [`BlockScan`] takes per Gaussian, independent of the number of frames.
 pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
@@ -126,31 +126,17 @@ impl<'a> BlockScan<'a> {
     }
 
     fn advance(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the line above saw that this processor has AVX2.
-            unsafe { self.advance_avx2(t, gaussians, changed) };
-            return;
-        }
-        self.advance_portable(t, gaussians, changed);
-    }
-
-    /// Adds a frame with the same operations as [`BlockScan::advance_portable`], but compiled for AVX2, which processes
-    /// several Gaussians at a time.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn advance_avx2(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
-        self.advance_portable(t, gaussians, changed);
+        vectorized(
+            #[inline(always)]
+            || self.advance_inlined(t, gaussians, changed),
+        );
     }
 
     /// Adds the Gaussians of frame `t` to the parts of the scan that need no cameras: current state, life spans,
     /// numbers of alive Gaussians, and motion sums. `changed` names the attributes of `gaussians` that may differ from
-    /// the previous frame.
-    ///
-    /// This function and the loops that it calls are inlined into each caller. So the compiler makes one version for
-    /// portable code and one for AVX2.
+    /// the previous frame. Inlined, so that [`vectorized`] compiles it for vector instructions.
     #[inline(always)]
-    fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
+    fn advance_inlined(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.state.update(gaussians, changed);
         let alpha_min = self.plan.alpha_min;
         // The opacities of all frames are compared with those of frame 0, which are new even if `changed` omits them.
@@ -298,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn avx2_gives_the_bits_of_the_baseline() {
+    fn vector_instructions_give_the_bits_of_the_baseline() {
         const LEN: usize = 77;
         for motion in [MotionParams::Literal, MotionParams::Runs] {
             for times in [[0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 1.5, 4.0, 4.5]] {
@@ -316,7 +302,7 @@ mod tests {
                     }
                     frame.position.set_row(t, [f32::NAN, f32::INFINITY, -3.0]);
                     wide.advance(t, &frame, NEEDED_ATTRIBUTES);
-                    baseline.advance_portable(t, &frame, NEEDED_ATTRIBUTES);
+                    baseline.advance_inlined(t, &frame, NEEDED_ATTRIBUTES);
                     wide.next_frame += 1;
                     baseline.next_frame += 1;
                 }

@@ -28,6 +28,7 @@ mod rig;
 mod robust_box;
 mod rows;
 mod schedule;
+mod vectorized;
 
 use crate::error::{Error, Result};
 pub use camera::Camera;
@@ -42,6 +43,7 @@ pub use rig::{Rig, RigView, Split};
 pub use robust_box::RobustBox;
 pub use rows::{AnomalyFlags, Statistic, StatisticArray, StatisticRows};
 pub use schedule::{FrameView, ViewSchedule};
+pub use vectorized::vectorized;
 
 /// Value of the spherical-harmonic (SH) basis function of degree 0. A color is 0.5 + SH_C0 · f_dc, where f_dc is its
 /// stored SH coefficient of degree 0.

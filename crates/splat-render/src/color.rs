@@ -29,10 +29,19 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
             values[i] = value;
         }
     }
+    let mut filled = [0.0; BLOCK];
     for (k, values) in values.iter().enumerate().take(coefficients(gaussians)) {
         for (channel, sum) in out.iter_mut().enumerate() {
             let plane = &gaussians.sh.plane(3 * k + channel)[ids.clone()][..n];
-            for i in 0..n {
+            // A short block is filled up: the compiler would process the rest of a loop of variable length one by one.
+            let plane = match plane.first_chunk::<BLOCK>() {
+                Some(plane) => plane,
+                None => {
+                    filled[..n].copy_from_slice(plane);
+                    &filled
+                }
+            };
+            for i in 0..BLOCK {
                 sum[i] += values[i] * plane[i];
             }
         }

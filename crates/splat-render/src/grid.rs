@@ -63,6 +63,7 @@ impl PixelGrid {
     /// - `at`: center of the splat in the image, pixels.
     /// - `half`: half the width and half the height of the splat, pixels of the image.
     /// - `size`: width and height of the image, pixels.
+    #[inline(always)]
     pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
         if self.stride == 1 {
             return rect;
@@ -84,6 +85,7 @@ impl PixelGrid {
 
     /// Returns how many columns of the grid lie to the left of column `pixel` of the image (`axis` 0), or how many rows
     /// of the grid lie above row `pixel` of the image (`axis` 1).
+    #[inline(always)]
     fn count_before(self, axis: usize, pixel: u32) -> u32 {
         pixel.saturating_sub(self.phase[axis]).div_ceil(self.stride)
     }

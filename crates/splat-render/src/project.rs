@@ -12,8 +12,8 @@ use std::ops::Range;
 use super::color::{self, Colors};
 use super::convention::{BLOCK, MIN_ALPHA, TILE};
 use super::grid::{PixelGrid, SampledView};
-use splat_core::Gaussians;
 use splat_core::exp_log::exp;
+use splat_core::{Gaussians, vectorized};
 
 /// Dilation: variance in pixels² that is added to the diagonal of every 2-D covariance, as in the original rasterizer.
 const DILATION: f64 = 0.3;
@@ -179,19 +179,10 @@ impl Splats {
 ///
 /// A Gaussian with a position, rotation, scale or opacity that is not finite is not visible.
 pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        /// Calls [`project_blocks`], compiled for AVX2. Operations are not fused, so results have the same bits.
-        #[target_feature(enable = "avx2")]
-        fn project_avx2(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
-            project_blocks(gaussians, ids, view, colored, out);
-        }
-        if is_x86_feature_detected!("avx2") {
-            // SAFETY: AVX2 was detected on the line above.
-            return unsafe { project_avx2(gaussians, ids, view, colored, out) };
-        }
-    }
-    project_blocks(gaussians, ids, view, colored, out);
+    vectorized(
+        #[inline(always)]
+        || project_blocks(gaussians, ids, view, colored, out),
+    );
 }
 
 /// Projects Gaussians like [`project`], in blocks of [`BLOCK`] Gaussians.

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
-use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams, vectorized};
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
 use crate::source::{
     BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, PreparedDeformation, ReadCounts, ReadPlan,
@@ -247,23 +247,13 @@ impl<L: MotionModel> PreparedBlock<L> {
         PreparedBlock { prepared: motion_model.prepare(&raw), raw }
     }
 
-    /// Computes the attributes `want` of the states at `time` into `out`, using AVX2 instructions if the processor has
-    /// them.
+    /// Computes the attributes `want` of the states at `time` into `out`.
     fn state(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {
         out.selected_attribute_values_mut(want).for_each(|column| column.resize(self.raw.len()));
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2, as the condition above checked.
-            return unsafe { self.state_avx2(motion_model, time, want, out) };
-        }
-        motion_model.state(time, &self.raw, &self.prepared, want, out)
-    }
-
-    /// Calls [`MotionModel::state`] in code that is compiled for AVX2 instructions.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn state_avx2(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {
-        motion_model.state(time, &self.raw, &self.prepared, want, out)
+        vectorized(
+            #[inline(always)]
+            || motion_model.state(time, &self.raw, &self.prepared, want, out),
+        )
     }
 }
 

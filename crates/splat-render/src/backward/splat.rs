@@ -13,7 +13,7 @@ use super::super::color;
 use super::super::convention::BLOCK;
 use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat, cross, dot, opacity};
 use super::sums::SplatSums;
-use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficient_count};
+use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficient_count, vectorized};
 
 /// Computes the gradients of the Gaussians whose projections are `splats`, and adds them to `out`, which must contain
 /// these Gaussians. `sums` holds the gradient sums of each splat.
@@ -24,44 +24,10 @@ pub(super) fn add_gradients(
     view: &CameraTerms,
     out: &mut GradientSpan,
 ) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        /// Does the same as [`add_blocks`], compiled for AVX2. Multiply-adds are not fused, so results have the same
-        /// bits as without AVX2.
-        #[target_feature(enable = "avx2")]
-        fn add_avx2(
-            gaussians: &Gaussians,
-            splats: &[Splat],
-            sums: &[SplatSums<f64>],
-            view: &CameraTerms,
-            out: &mut GradientSpan<'_>,
-        ) {
-            add_blocks(gaussians, splats, sums, view, out);
-        }
-        /// Does the same as [`add_blocks`], compiled for AVX-512. Results have the same bits as without AVX-512.
-        #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
-        fn add_avx512(
-            gaussians: &Gaussians,
-            splats: &[Splat],
-            sums: &[SplatSums<f64>],
-            view: &CameraTerms,
-            out: &mut GradientSpan<'_>,
-        ) {
-            add_blocks(gaussians, splats, sums, view, out);
-        }
-        if is_x86_feature_detected!("avx512f")
-            && is_x86_feature_detected!("avx512dq")
-            && is_x86_feature_detected!("avx512vl")
-        {
-            // SAFETY: AVX-512 F, DQ and VL were detected on the lines above.
-            return unsafe { add_avx512(gaussians, splats, sums, view, out) };
-        }
-        if is_x86_feature_detected!("avx2") {
-            // SAFETY: AVX2 was detected on the line above.
-            return unsafe { add_avx2(gaussians, splats, sums, view, out) };
-        }
-    }
-    add_blocks(gaussians, splats, sums, view, out);
+    vectorized(
+        #[inline(always)]
+        || add_blocks(gaussians, splats, sums, view, out),
+    );
 }
 
 /// Does the same as [`add_gradients`], for [`BLOCK`] Gaussians at a time. Inlined, so that each instruction set has its
