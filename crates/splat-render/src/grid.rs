@@ -4,7 +4,6 @@
 use std::num::NonZeroU32;
 
 use super::convention::TILE;
-use super::project::TileRect;
 use splat_core::Camera;
 
 /// Grid of pixels of an image: the pixels whose column and row have given remainders when divided by the stride.
@@ -54,40 +53,31 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Returns the tiles of a render of this grid in which a splat can change a pixel. Each of these tiles has 16×16
-    /// pixels of the grid. The result is empty if the splat changes no pixel of the grid.
+    /// Returns the range of tiles, as (first, end), of a render of this grid that a splat can change along one axis: 0
+    /// for x, 1 for y. Each of these tiles has 16×16 pixels of the grid. The range is empty if the splat changes no pixel
+    /// of the grid. All numbers are integers in f64, so that the compiler vectorizes the calling loop.
     ///
-    /// The splat can change only pixels that lie in `rect` and are at most `half` from `at` along x and along y.
+    /// The splat can change only pixels that lie in the tiles of `image_range` and are at most `half` from `at`.
     ///
-    /// - `rect`: tiles of the full image (16×16 pixels of the image each) that the splat can change.
+    /// - `image_range`: tiles of the full image (16 pixels of the image each) that the splat can change.
     /// - `at`: center of the splat in the image, pixels.
-    /// - `half`: half the width and half the height of the splat, pixels of the image.
-    /// - `size`: width and height of the image, pixels.
+    /// - `half`: half the extent of the splat along the axis, pixels of the image.
+    /// - `size`: extent of the image along the axis, pixels.
     #[inline(always)]
-    pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
+    pub(super) fn tile_range(self, axis: usize, (start, end): (f64, f64), at: f64, half: f64, size: f64) -> (f64, f64) {
+        const TILE_PIXELS: f64 = TILE as f64;
         if self.stride == 1 {
-            return rect;
+            return (start, end);
         }
-        let range = |axis: usize, start: u32, end: u32| {
-            // A float-to-integer cast saturates: values below 0 become 0.
-            let first = start.saturating_mul(TILE).max((at[axis] - half[axis]).ceil() as u32);
-            let last = end
-                .saturating_mul(TILE)
-                .min(size[axis])
-                .min(((at[axis] + half[axis]).floor() as u32).saturating_add(1));
-            let [first, last] = [first, last].map(|pixel| self.count_before(axis, pixel));
-            (first / TILE, if first < last { last.div_ceil(TILE) } else { first / TILE })
-        };
-        let (x0, x1) = range(0, rect.x0, rect.x1);
-        let (y0, y1) = range(1, rect.y0, rect.y1);
-        TileRect { x0, x1, y0, y1 }
-    }
-
-    /// Returns how many columns of the grid lie to the left of column `pixel` of the image (`axis` 0), or how many rows
-    /// of the grid lie above row `pixel` of the image (`axis` 1).
-    #[inline(always)]
-    fn count_before(self, axis: usize, pixel: u32) -> u32 {
-        pixel.saturating_sub(self.phase[axis]).div_ceil(self.stride)
+        let first = (start * TILE_PIXELS).max((at - half).ceil());
+        let last = (end * TILE_PIXELS).min(size).min((at + half).floor().max(0.0) + 1.0);
+        // Number of columns or rows of the grid before a pixel. The quotient of two 32-bit integers in f64 is rounded to
+        // an integer only if it is one.
+        let count_before =
+            |pixel: f64| ((pixel - f64::from(self.phase[axis])).max(0.0) / f64::from(self.stride)).ceil();
+        let (first, last) = (count_before(first), count_before(last));
+        let start = (first / TILE_PIXELS).floor();
+        (start, if first < last { (last / TILE_PIXELS).ceil() } else { start })
     }
 }
 
@@ -128,5 +118,29 @@ mod tests {
         let grid = PixelGrid::new(NonZeroU32::new(3).unwrap(), [5, 1]);
         assert_eq!([0, 1, 2].map(|index| grid.pixel(0, index)), [2, 5, 8]);
         assert_eq!([0, 1, 2].map(|index| grid.pixel(1, index)), [1, 4, 7]);
+    }
+
+    #[test]
+    fn tile_range_holds_the_pixels_of_the_grid_within_reach() {
+        const SIZE: u32 = 150;
+        let mut empty = 0;
+        for (stride, phase) in [(2, 0), (3, 2), (5, 1), (7, 6)] {
+            let grid = PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase; 2]);
+            for step in -40..400 {
+                let at = 0.5 * f64::from(step) - 0.2;
+                for half in [0.1, 1.4, 9.0, 40.0] {
+                    let (start, end) = (1.0, 9.0);
+                    let is_reached = |pixel: u32| (16..144).contains(&pixel) && (f64::from(pixel) - at).abs() <= half;
+                    let reached = (0..grid.size([SIZE; 2])[0]).filter(|&index| is_reached(grid.pixel(0, index)));
+                    let tiles: Vec<u32> = reached.map(|index| index / TILE).collect();
+                    let (first, last) = grid.tile_range(0, (start, end), at, half, f64::from(SIZE));
+                    empty += usize::from(tiles.is_empty());
+                    let expected = tiles.first().zip(tiles.last()).map(|(&first, &last)| (first, last + 1));
+                    let found = (first < last).then_some((first as u32, last as u32));
+                    assert_eq!(found, expected, "stride {stride}, phase {phase}, at {at}, half {half}");
+                }
+            }
+        }
+        assert!(empty > 100, "some must reach no pixel, {empty} do");
     }
 }

@@ -202,6 +202,7 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, 
         }
         let before = out.splats.len();
         footprints.fill(gaussians, block.clone(), view);
+        footprints.fill_tiles(block.len(), view);
         for i in 0..block.len() {
             if let Some((splat, rect)) = footprints.splat(i, (start + i) as u32, view) {
                 out.splats.push(splat);
@@ -238,6 +239,16 @@ struct ProjectedSplats {
     /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
     radius: [f64; BLOCK],
     opacity: [f64; BLOCK],
+    cutoff: [f64; BLOCK],
+    /// Tiles that the splat can change, as in [`TileRect`]: x0, x1, y0 and y1, integers in f64.
+    tiles: [[f64; BLOCK]; 4],
+    /// Tiles of the full image in which the original CUDA rasterizer draws the splat, in the same order, without those
+    /// that its ellipse alpha ≥ 1/255 cannot touch.
+    image_tiles: [[f64; BLOCK]; 4],
+    /// 1 if the splat can change a pixel, otherwise 0.
+    is_visible: [u64; BLOCK],
+    /// 1 if the ellipse alpha ≥ 1/255 contains a pixel of the image outside `image_tiles`, otherwise 0.
+    is_cut_off: [u64; BLOCK],
 }
 
 impl Default for ProjectedSplats {
@@ -255,6 +266,11 @@ impl Default for ProjectedSplats {
             half_v: zero,
             radius: zero,
             opacity: zero,
+            cutoff: zero,
+            tiles: [zero; 4],
+            image_tiles: [zero; 4],
+            is_visible: [0; BLOCK],
+            is_cut_off: [0; BLOCK],
         }
     }
 }
@@ -293,53 +309,64 @@ impl ProjectedSplats {
         }
     }
 
+    /// Computes the tiles that the first `n` splats of the block can change. The loop has no branches, like that of
+    /// [`ProjectedSplats::fill`].
+    #[inline(always)]
+    fn fill_tiles(&mut self, n: usize, view: &CameraTerms) {
+        let size = view.image_size.map(f64::from);
+        let image_tiles = view.image_tiles.map(f64::from);
+        for i in 0..n.min(BLOCK) {
+            let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
+            let is_finite = depth.is_finite() & u.is_finite() & v.is_finite() & self.falloff_x[i].is_finite();
+            let cutoff = log2_bound(opacity / f64::from(MIN_ALPHA)) + CUTOFF_SLACK;
+            // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255
+            // can touch.
+            let root = cutoff.sqrt();
+            let (radius, half_u, half_v) = (self.radius[i], root * self.half_u[i], root * self.half_v[i]);
+            let (x0, x1) = image_tile_range(u, radius, half_u, image_tiles[0]);
+            let (y0, y1) = image_tile_range(v, radius, half_v, image_tiles[1]);
+            let (start_x, end_x) = view.grid.tile_range(0, (x0, x1), u, half_u, size[0]);
+            let (start_y, end_y) = view.grid.tile_range(1, (y0, y1), v, half_v, size[1]);
+            let is_drawn = (depth > view.near) & is_finite & (opacity >= f64::from(MIN_ALPHA)) & (x0 < x1) & (y0 < y1);
+            self.is_visible[i] = u64::from(is_drawn & (start_x < end_x) & (start_y < end_y));
+            self.is_cut_off[i] = u64::from(
+                is_cut_off(u, half_u, (x0, x1), image_tiles[0]) | is_cut_off(v, half_v, (y0, y1), image_tiles[1]),
+            );
+            self.cutoff[i] = cutoff;
+            (self.tiles[0][i], self.tiles[1][i], self.tiles[2][i], self.tiles[3][i]) = (start_x, end_x, start_y, end_y);
+            (self.image_tiles[0][i], self.image_tiles[1][i]) = (x0, x1);
+            (self.image_tiles[2][i], self.image_tiles[3][i]) = (y0, y1);
+        }
+    }
+
     /// Returns two values for Gaussian `i` of the block: its splat, and the tiles that the splat can change. Returns
     /// `None` if it cannot change any pixel. `id` is the index of the Gaussian in the frame.
     #[inline(always)]
     fn splat(&self, i: usize, id: u32, view: &CameraTerms) -> Option<(Splat, TileRect)> {
-        let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
-        let finite = depth.is_finite() && u.is_finite() && v.is_finite() && self.falloff_x[i].is_finite();
-        if !(depth > view.near && finite && opacity >= f64::from(MIN_ALPHA)) {
+        if self.is_visible[i] == 0 {
             return None;
         }
-        let cutoff = log2_bound(opacity / f64::from(MIN_ALPHA)) + CUTOFF_SLACK;
-        // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255 can
-        // touch.
-        let root = cutoff.sqrt();
-        let (radius, half) = (self.radius[i], [root * self.half_u[i], root * self.half_v[i]]);
-        let image_tiles = view.image_tiles;
-        let (x0, x1) = tile_range(u, radius, half[0], image_tiles[0]);
-        let (y0, y1) = tile_range(v, radius, half[1], image_tiles[1]);
-        if x0 >= x1 || y0 >= y1 {
-            return None;
-        }
-        let image_rect = TileRect { x0, x1, y0, y1 };
-        let rect = view.grid.tiles(image_rect, [u, v], half, view.image_size);
-        if rect.x0 >= rect.x1 || rect.y0 >= rect.y1 {
-            return None;
-        }
-        // A splat is cut off if its ellipse alpha ≥ 1/255 contains a pixel of the image outside the tiles of the
-        // original rasterizer.
-        let is_cut = |at: f64, half: f64, (start, end): (u32, u32), tiles: u32| {
-            let [start_pixel, end_pixel] = [start, end].map(|tile| f64::from(tile) * f64::from(TILE));
-            (start > 0 && at - half <= start_pixel - 1.0) || (end < tiles && at + half >= end_pixel)
+        let rect = |[x0, x1, y0, y1]: &[[f64; BLOCK]; 4]| TileRect {
+            x0: x0[i] as u32,
+            x1: x1[i] as u32,
+            y0: y0[i] as u32,
+            y1: y1[i] as u32,
         };
-        let is_cut_off = view.grid.stride() > 1
-            && (is_cut(u, half[0], (x0, x1), image_tiles[0]) || is_cut(v, half[1], (y0, y1), image_tiles[1]));
+        let is_cut_off = view.grid.stride() > 1 && self.is_cut_off[i] != 0;
         let splat = Splat {
-            u,
-            v,
+            u: self.u[i],
+            v: self.v[i],
             falloff_x: self.falloff_x[i] as f32,
             shear: self.shear[i] as f32,
             falloff_y: self.falloff_y[i] as f32,
-            cutoff: cutoff as f32,
-            opacity: opacity as f32,
+            cutoff: self.cutoff[i] as f32,
+            opacity: self.opacity[i] as f32,
             sort_depth: self.sort_depth[i],
             color: [0.0; 3],
             id,
-            drawn_tiles: if is_cut_off { image_rect.narrow() } else { Splat::UNBOUNDED },
+            drawn_tiles: if is_cut_off { rect(&self.image_tiles).narrow() } else { Splat::UNBOUNDED },
         };
-        Some((splat, rect))
+        Some((splat, rect(&self.tiles)))
     }
 }
 
@@ -419,20 +446,29 @@ pub(super) fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + exp(clamp_to(-f64::from(logit), LOGARITHM_LIMIT)))
 }
 
-/// Returns the range of tiles along one axis, as (first, end), that a splat can change. These are the tiles that the
-/// original CUDA rasterizer draws, except tiles whose pixels are all further than `half` from the center of the splat.
+/// Returns the range of tiles of the full image along one axis, as (first, end), that a splat can change: integers in
+/// f64. These are the tiles that the original CUDA rasterizer draws, except tiles whose pixels are all further than
+/// `half` from the center of the splat.
 ///
 /// - `at`: center of the splat along the axis, pixels.
 /// - `radius`: half the side of the square that the original rasterizer draws, pixels.
 /// - `half`: half the extent of the splat along the axis (where alpha ≥ 1/255), pixels.
 /// - `tiles`: number of tiles of the image along the axis.
 #[inline(always)]
-fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
+fn image_tile_range(at: f64, radius: f64, half: f64, tiles: f64) -> (f64, f64) {
     let tile = f64::from(TILE);
     let start = ((at - radius) / tile).floor().max(((at - half - (tile - 1.0)) / tile).ceil());
     let end = ((at + radius + tile - 1.0) / tile).floor().min(((at + half) / tile).floor() + 1.0);
-    // A float-to-integer cast saturates: values below 0 become 0.
-    ((start as u32).min(tiles), (end as u32).min(tiles))
+    // NaN becomes 0.
+    (start.max(0.0).min(tiles), end.max(0.0).min(tiles))
+}
+
+/// Returns whether a splat reaches a pixel of the image outside the tiles `start` to below `end` along one axis, so that
+/// the original CUDA rasterizer cuts it off there. The other arguments are those of [`image_tile_range`].
+#[inline(always)]
+fn is_cut_off(at: f64, half: f64, (start, end): (f64, f64), tiles: f64) -> bool {
+    let [start_pixel, end_pixel] = [start * f64::from(TILE), end * f64::from(TILE)];
+    ((start > 0.0) & (at - half <= start_pixel - 1.0)) | ((end < tiles) & (at + half >= end_pixel))
 }
 
 /// Returns an upper bound of log₂ x for normal positive x, at most 0.087 above it.
@@ -501,9 +537,9 @@ mod tests {
         for step in -400..4000 {
             let at = f64::from(step) * 0.1;
             for radius in [1.0f64, 3.0, 17.0, 250.0] {
-                let expected_start = (((at - radius) / 16.0) as i64).clamp(0, 20) as u32;
-                let expected_end = (((at + radius + 15.0) / 16.0) as i64).clamp(0, 20) as u32;
-                let (start, end) = tile_range(at, radius, 1e9, 20);
+                let expected_start = (((at - radius) / 16.0) as i64).clamp(0, 20) as f64;
+                let expected_end = (((at + radius + 15.0) / 16.0) as i64).clamp(0, 20) as f64;
+                let (start, end) = image_tile_range(at, radius, 1e9, 20.0);
                 if expected_start < expected_end {
                     assert_eq!((start, end), (expected_start, expected_end), "at {at} radius {radius}");
                 } else {
