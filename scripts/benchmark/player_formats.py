@@ -7,8 +7,9 @@
 Every model is compressed to a tenth first. Then `convert` writes that result in each format. `compress` also writes a
 `.splatv` directly, and refines the colors of SH degree 0 for it, except if the model is a `.splatv` already. The table
 has the bytes of the file or folder, processor seconds, and PSNR of the file as this program reads it, on the test views
-against renders of the original model. A `.4dgs` is read by the package fourdgs of PYTHON (fourdgs_frames.py); nothing here reads a `.gsd`.
-The frames are those of the cameras' times, 30 for the captured scene. Folders of `.spz` files are made frame by frame.
+against renders of the original model. A `.4dgs` is read by the package fourdgs of PYTHON (fourdgs_frames.py); nothing
+here reads a `.gsd`. The frames are those of the cameras' times, 30 for the captured scene. Folders of `.spz` files are
+made frame by frame.
 """
 
 import shutil

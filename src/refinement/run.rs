@@ -338,6 +338,7 @@ impl<'a> RefineRun<'a> {
 
     fn step(&mut self, optimizer: &mut OptimizerState<'_>, schedule: &RateSchedule) -> Result<()> {
         let view = self.sampler.next();
+        // Enters the thread pool once. From outside, every parallel loop of the step would have to wake a thread.
         rayon::scope(|_| optimizer.step(view, schedule))?;
         self.progress.advance(1);
         Ok(())

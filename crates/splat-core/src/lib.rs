@@ -43,6 +43,8 @@ pub use rig::{Rig, RigView, Split};
 pub use robust_box::RobustBox;
 pub use rows::{AnomalyFlags, Statistic, StatisticArray, StatisticRows};
 pub use schedule::{FrameView, ViewSchedule};
+#[cfg(target_arch = "x86_64")]
+pub use vectorized::has_avx512;
 pub use vectorized::vectorized;
 
 /// Value of the spherical-harmonic (SH) basis function of degree 0. A color is 0.5 + SH_C0 · f_dc, where f_dc is its

@@ -1,5 +1,11 @@
 //! Compilation of loops for the vector instructions of the processor on which the program runs.
 
+/// Returns whether the processor has the parts F, DQ and VL of AVX-512, which this project uses together.
+#[cfg(target_arch = "x86_64")]
+pub fn has_avx512() -> bool {
+    is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl")
+}
+
 /// Runs `job`, compiled for AVX-512 or AVX2 if the processor has them, so that its loops process up to 16 values at a
 /// time. The result has the same bits with every instruction set, because operations are neither fused nor reordered.
 ///
@@ -18,10 +24,7 @@ pub fn vectorized<R>(job: impl FnOnce() -> R) -> R {
             job()
         }
         if is_x86_feature_detected!("avx2") {
-            if is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512vl")
-            {
+            if has_avx512() {
                 // SAFETY: the processor has all features of the function, as the conditions above checked.
                 return unsafe { run_avx512(job) };
             }

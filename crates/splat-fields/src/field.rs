@@ -17,7 +17,7 @@ use splat_core::{AttributeValues, Attributes, Gaussians};
 use super::deltas::Deltas;
 use super::instruction_set::{Evaluation, InstructionSet, run_on_best};
 use super::linear::{CacheLine, LANES, Linear};
-use super::planes::{Planes, PreparedPlanes, TimeLines};
+use super::planes::{Planes, PreparedPlanes};
 use super::tensors::{Lookup, Tensors};
 use super::voxel::VoxelMask;
 
@@ -285,19 +285,16 @@ impl Field {
             return Err(Error::internal("the block was prepared by another deformation field"));
         }
         let time = time as f32;
-        let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
-        run_on_best(DeltaEvaluation { field: self, prepared, time, lines, scratch, out });
+        run_on_best(DeltaEvaluation { field: self, prepared, time, scratch, out });
         Ok(())
     }
 }
 
-/// Evaluation of [`Field::deltas`] at `time` into `out`. `lines` are the feature planes with a time axis, interpolated
-/// at this time; it is empty if the field has no planes.
+/// [`Evaluation`] that computes the result of [`Field::deltas`] at `time` into `out`.
 struct DeltaEvaluation<'a> {
     field: &'a Field,
     prepared: &'a PreparedPositions,
     time: f32,
-    lines: Vec<TimeLines>,
     scratch: &'a mut LayerBuffers,
     out: &'a mut Deltas,
 }
@@ -306,7 +303,8 @@ impl Evaluation for DeltaEvaluation<'_> {
     /// Evaluates the field in groups of [`LANES`] Gaussians.
     #[inline(always)]
     fn run<S: InstructionSet>(self) {
-        let DeltaEvaluation { field, prepared, time, lines, scratch, out } = self;
+        let DeltaEvaluation { field, prepared, time, scratch, out } = self;
+        let lines = field.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
         let LayerBuffers { features, trunk, hidden } = scratch;
         for start in (0..prepared.rows).step_by(LANES) {
             let lanes = LANES.min(prepared.rows - start);

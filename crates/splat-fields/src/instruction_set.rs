@@ -1,6 +1,8 @@
 //! Instruction sets for which the evaluation of networks is compiled, and the choice of one when the program runs.
 
 use super::linear::CacheLine;
+#[cfg(target_arch = "x86_64")]
+use splat_core::has_avx512;
 
 /// Instruction set for which an [`Evaluation`] is compiled.
 pub(super) trait InstructionSet {
@@ -46,8 +48,8 @@ impl InstructionSet for Avx512 {
     #[inline(always)]
     fn add_product(sum: &mut CacheLine, x: &CacheLine, w: f32) {
         use std::arch::x86_64::{_mm512_fmadd_ps, _mm512_load_ps, _mm512_set1_ps, _mm512_store_ps};
-        // SAFETY: code for this instruction set runs only in `run_avx512`, after AVX-512F was detected. A `CacheLine` is
-        // 16 values, aligned to 64 bytes.
+        // SAFETY: code for this instruction set runs only after AVX-512 was detected. A `CacheLine` holds 16 values and
+        // is aligned to 64 bytes.
         unsafe {
             let next = _mm512_fmadd_ps(_mm512_load_ps(x.0.as_ptr()), _mm512_set1_ps(w), _mm512_load_ps(sum.0.as_ptr()));
             _mm512_store_ps(sum.0.as_mut_ptr(), next);
@@ -66,7 +68,7 @@ pub(super) trait Evaluation {
 pub(super) fn run_on_best<E: Evaluation>(evaluation: E) {
     #[cfg(target_arch = "x86_64")]
     {
-        #[target_feature(enable = "avx2,fma,avx512f,avx512vl")]
+        #[target_feature(enable = "avx2,fma,avx512f,avx512dq,avx512vl")]
         fn run_avx512<E: Evaluation>(evaluation: E) {
             evaluation.run::<Avx512>();
         }
@@ -75,11 +77,11 @@ pub(super) fn run_on_best<E: Evaluation>(evaluation: E) {
             evaluation.run::<Avx2>();
         }
         if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vl") {
-                // SAFETY: all four were detected on the lines above.
+            if has_avx512() {
+                // SAFETY: the processor has all features of the function, as the conditions above checked.
                 return unsafe { run_avx512(evaluation) };
             }
-            // SAFETY: AVX2 and FMA were detected above.
+            // SAFETY: the processor has AVX2 and FMA, as the condition above checked.
             return unsafe { run_avx2(evaluation) };
         }
     }

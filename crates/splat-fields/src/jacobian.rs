@@ -106,7 +106,7 @@ impl Field {
     }
 }
 
-/// Evaluation of [`Field::position_jacobian`] into `out`. `planes`: the feature planes with what was prepared for the
+/// [`Evaluation`] that computes the result of [`Field::position_jacobian`] into `out`. `planes`: the feature planes with what was prepared for the
 /// positions; `None` if the field has no planes.
 struct PositionJacobian<'a> {
     field: &'a Field,

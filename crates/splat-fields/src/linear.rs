@@ -22,7 +22,7 @@ pub(super) struct CacheLine(pub(super) [f32; LANES]);
 /// Number of outputs of a layer whose sums are computed together (a panel).
 const PANEL: usize = 4;
 
-/// Number of panels whose sums are computed together if the processor has AVX-512.
+/// Number of panels whose sums are computed together with AVX-512.
 const WIDE: usize = 4;
 
 /// Fully connected layer `y = W·x + b` with inputs x and outputs y.
@@ -104,8 +104,8 @@ impl Linear {
         });
     }
 
-    /// Calls `take` with the index of every output and its values before ReLU for `input` `[inputs, LANES]`. Includes
-    /// the outputs that fill up the last panel.
+    /// Computes the outputs before ReLU for `input` `[inputs, LANES]`, and calls `take` with the index and the values of
+    /// each. The outputs that fill up the last panel are included.
     #[inline(always)]
     fn for_each_output<S: InstructionSet>(&self, input: &[CacheLine], mut take: impl FnMut(usize, &CacheLine)) {
         let input = &input[..self.inputs];
@@ -264,11 +264,10 @@ mod tests {
 
     #[cfg(target_arch = "x86_64")]
     #[test]
+    #[ignore = "needs AVX-512"]
     fn avx512_gives_the_bits_of_avx2() {
         use super::super::instruction_set::{Avx2, Avx512};
-        if !is_x86_feature_detected!("avx512f") {
-            return;
-        }
+        assert!(splat_core::has_avx512(), "this processor has no AVX-512");
         for (inputs, outputs) in SIZES {
             let layer = layer(inputs, outputs);
             assert_eq!(outputs_and_gradients::<Avx512>(&layer), outputs_and_gradients::<Avx2>(&layer));

@@ -295,7 +295,8 @@ impl Network {
     }
 }
 
-/// Evaluation of [`Network::motion`] at `time` into `out`, for the heads of the attributes `want`.
+/// [`Evaluation`] that computes the result of [`Network::motion`] at `time` into `out`, for the heads of the attributes
+/// `want`.
 struct MotionEvaluation<'a> {
     network: &'a Network,
     encoded: &'a EncodedPositions,
@@ -333,7 +334,7 @@ impl Evaluation for MotionEvaluation<'_> {
     }
 }
 
-/// Evaluation of [`Network::warp_jacobian`] at `time` into `out`.
+/// [`Evaluation`] that computes the result of [`Network::warp_jacobian`] at `time` into `out`.
 struct WarpJacobian<'a> {
     network: &'a Network,
     encoded: &'a EncodedPositions,

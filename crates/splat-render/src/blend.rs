@@ -217,10 +217,7 @@ impl BlendKernel {
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") {
             all.push(BlendKernel::Avx2);
-            if is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512vl")
-            {
+            if splat_core::has_avx512() {
                 all.push(BlendKernel::Avx512);
             }
         }

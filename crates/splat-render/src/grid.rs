@@ -53,9 +53,9 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Returns the range of tiles, as (first, end), of a render of this grid that a splat can change along one axis: 0
-    /// for x, 1 for y. Each of these tiles has 16×16 pixels of the grid. The range is empty if the splat changes no pixel
-    /// of the grid. All numbers are integers in f64, so that the compiler vectorizes the calling loop.
+    /// Returns which tiles of a render of this grid a splat can change: the range (first, end) of their columns if `axis`
+    /// is 0, of their rows if it is 1. Each of these tiles has 16×16 pixels of the grid. The range is empty if the splat
+    /// changes no pixel of the grid. Tile numbers are integers in f64, so that the compiler vectorizes the calling loop.
     ///
     /// The splat can change only pixels that lie in the tiles of `image_range` and are at most `half` from `at`.
     ///

@@ -245,7 +245,7 @@ struct ProjectedSplats {
     /// Tiles of the full image in which the original CUDA rasterizer draws the splat, in the same order, without those
     /// that its ellipse alpha ≥ 1/255 cannot touch.
     image_tiles: [[f64; BLOCK]; 4],
-    /// 1 if the splat can change a pixel, otherwise 0.
+    /// 1 if the splat can change a pixel, otherwise 0. As wide as the other arrays, which suits vector instructions.
     is_visible: [u64; BLOCK],
     /// 1 if the ellipse alpha ≥ 1/255 contains a pixel of the image outside `image_tiles`, otherwise 0.
     is_cut_off: [u64; BLOCK],

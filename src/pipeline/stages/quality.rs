@@ -159,8 +159,8 @@ impl QualityStage {
     }
 
     /// Opens the output that was written to `path`, as a copy in a scratch folder with the ending of its kind. Returns
-    /// `None` if it is not read back: see [`QualityStage::reads_no_output`]. A `.splatv` is not read back either if
-    /// frames have times outside the range from 0 to 1, because it then stores times that are scaled to this range.
+    /// `None` for outputs that are not read back: those of [`QualityStage::reads_no_output`], and a `.splatv` of frames
+    /// with times outside the range from 0 to 1, because it stores times scaled to this range.
     ///
     /// # Errors
     /// Fails if the output cannot be copied or read.
