@@ -4,7 +4,7 @@
 use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::Read;
-use std::os::fd::{FromRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -67,15 +67,19 @@ impl BrokenStream {
     }
 }
 
-/// Opens a new pseudo-terminal. Returns its two ends: that of the terminal window, and that of the program.
+/// Opens a new pseudo-terminal. Returns its two ends: that of the terminal window, and that of the program. Both have
+/// the flag close-on-exec: a copy in a process that another test starts at the same time would keep the window open.
 fn terminal() -> (OwnedFd, OwnedFd) {
-    let (mut window, mut program) = (-1, -1);
-    let none = std::ptr::null_mut();
-    // SAFETY: the first two pointers are valid for writes, and openpty allows the others to be null.
-    let made = unsafe { libc::openpty(&mut window, &mut program, none, none.cast(), none.cast()) };
-    assert_eq!(made, 0, "no terminal");
-    // SAFETY: openpty has just opened both descriptors, and nothing else owns them.
-    unsafe { (OwnedFd::from_raw_fd(window), OwnedFd::from_raw_fd(program)) }
+    let window: OwnedFd = File::options().read(true).write(true).open("/dev/ptmx").expect("no terminal").into();
+    let flags = libc::O_RDWR | libc::O_NOCTTY | libc::O_CLOEXEC;
+    // SAFETY: unlockpt and this request take an open descriptor and no pointer.
+    let program = unsafe {
+        assert_eq!(libc::unlockpt(window.as_raw_fd()), 0, "the terminal is locked");
+        libc::ioctl(window.as_raw_fd(), libc::TIOCGPTPEER, flags)
+    };
+    assert!(program >= 0, "no end of the terminal for the program");
+    // SAFETY: the request has just opened the descriptor, and nothing else owns it.
+    (window, unsafe { OwnedFd::from_raw_fd(program) })
 }
 
 /// Quick commands that print something, each with its exit code.
