@@ -198,7 +198,8 @@ fn states(criterion: &mut Criterion<Processor>) {
             _ => (model, BLOCK),
         };
         group.throughput(Throughput::Elements(count as u64));
-        let opened = splatsieve::models::open(&path, &OpenOptions::default());
+        let opened =
+            splatsieve::models::open(&path, &OpenOptions::default()).and_then(splatsieve::models::Opened::into_linked);
         let family = opened.and_then(|family| family.with_times(times.clone())).expect("a trained model");
         let mut reader = family.source().open(Ids::Range(0..count)).expect("Gaussians");
         let (mut frame, mut out) = (0, Gaussians::zeros(0, family.source().info().sh_degree));

@@ -43,12 +43,12 @@ fn write_frames(folder: &Path) {
 }
 
 #[test]
-fn memory_of_opening_matches_the_estimate() {
+fn memory_of_linking_matches_the_estimate() {
     let folder = tempfile::tempdir().unwrap();
     rayon::ThreadPoolBuilder::new().num_threads(2).build_global().unwrap();
     write_frames(folder.path());
     let options = OpenOptions { scratch: Some(folder.path().to_owned()), ..OpenOptions::default() };
-    let (input, peak) = memory::peak(|| open(folder.path(), &options).unwrap());
+    let (input, peak) = memory::peak(|| open(folder.path(), &options).unwrap().into_linked().unwrap());
     let tracks = input.source().info().count;
     assert!((LIVING * FRAMES / LIFE..LIVING * FRAMES / LIFE * 6 / 5).contains(&tracks), "{tracks}");
     let residence = input.memory_profile();

@@ -22,7 +22,7 @@ use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::Attributes;
 use crate::models;
 use crate::models::stream::pack_stream;
-use crate::models::{ColumnInfo, InputModel, ModelSize, TimeOrigin};
+use crate::models::{ColumnInfo, InputModel, ModelSize, Opened, TimeOrigin};
 use crate::outputs::bounds::{ErrorBounds, MaxError};
 use crate::outputs::container::{
     FRAME_BLOCK, FRAME_BLOCK_WITH_ERROR_BOUNDS, Packing, join_container, spill_blocks, write_container,
@@ -33,8 +33,8 @@ use crate::passes::FrameReaders;
 use crate::pipeline::stages::write::ENCODE_SECONDS_PER_STATE;
 use crate::pipeline::summary::InputSummary;
 use crate::scene::{
-    InputOptions, OpenedInput, first_frame_box, frame_quota, is_linked, link_stream, open_cache, open_input,
-    open_stream,
+    InputOptions, OpenedInput, UntrackedInput, first_frame_box, frame_quota, is_linked, open_cache, open_input,
+    open_stream, receive_unlinked,
 };
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
@@ -91,7 +91,10 @@ fn pack_whole(
     check_container_name(output, "convert")?;
     check_target(output, TargetKind::File, &[&input.path], overwrite)?;
     let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {
-        Some(stream) if is_linked(stream.header(), input) => link_stream(stream, input, None)?,
+        Some(stream) if is_linked(stream.header(), input) => {
+            let frames = Opened::Unlinked(Box::new(receive_unlinked(stream, input)?));
+            UntrackedInput::with_own_times(frames, None).track(&input.path)?
+        }
         Some(stream) => return pack_arriving(stream, input, output, storing, overwrite),
         None => open_input(input)?,
     };
@@ -269,7 +272,7 @@ pub struct InputInfo {
 pub fn info(options: &InputOptions) -> Result<InputInfo> {
     let input: Box<dyn InputModel> = match options.is_stream() {
         true => open_input(options)?.input,
-        false => models::open(&options.path, &options.open_options())?,
+        false => models::open(&options.path, &options.open_options())?.into_linked()?,
     };
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));

@@ -2,25 +2,26 @@
 
 use gseq::{Encoding, Reader, TileId};
 
-use super::linked::LinkedFrames;
+use super::linked::UnlinkedFrames;
 use super::size::bytes_read_for;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::container::Container;
-use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, TimeOrigin};
+use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, TimeOrigin};
+use crate::models::opened::{FrameFormat, Opened};
 use crate::source::FrameSource;
 
-/// Model format of containers of frames (`.gseq`), which store the state of every Gaussian at every frame: recognizes
+/// Format of containers of frames (`.gseq`), which store the state of every Gaussian at every frame: recognizes
 /// and opens a file.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: FrameFormat = FrameFormat {
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
         let container = Container::open_within(path, options.memory)?;
         options.refuse_for(path)?;
         if options.link.links_frames_always() && container.info().times.len() > 1 {
-            let joins = options.link.joins_tracks();
-            return Ok(Box::new(LinkedFrames::relink(&container, "linked gseq container", joins, &options.ply())?));
+            let frames = UnlinkedFrames::from_model(Box::new(container), "linked gseq container", options);
+            return Ok(Opened::Unlinked(Box::new(frames)));
         }
-        Ok(Box::new(container))
+        Ok(Opened::Model(Box::new(container)))
     },
 };
 

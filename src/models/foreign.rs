@@ -84,7 +84,9 @@ mod tests {
     #[test]
     fn unsupported_models_are_named_with_advice() {
         let folder = tempfile::tempdir().unwrap();
-        let error_message = |path: &Path| models::open(path, &OpenOptions::default()).err().unwrap().to_string();
+        let error_message = |path: &Path| {
+            models::open(path, &OpenOptions::default()).and_then(models::Opened::into_linked).err().unwrap().to_string()
+        };
         let file = folder.path().join("step-000029999.ckpt");
         let one = || PythonValue::Tensor(tensor(0, &[1], &[0.0]));
         let pipeline =

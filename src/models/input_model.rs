@@ -446,6 +446,9 @@ pub enum LinkMode {
 }
 
 impl LinkMode {
+    /// Reason for linking frames that the user asked to link, for messages to the user.
+    pub(super) const REQUESTED: &str = "as requested";
+
     /// Returns whether frames are linked even if the input already identifies each Gaussian across frames.
     pub fn links_frames_always(self) -> bool {
         matches!(self, LinkMode::Always | LinkMode::Apart)

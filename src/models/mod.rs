@@ -1,6 +1,6 @@
 //! Model formats: each recognizes, opens, evaluates and writes the models of one trainer.
 //!
-//! A model format is one module in this folder, with its entries in `MODEL_FORMATS`. Code outside its module never asks
+//! A model format is one module in this folder, with its entries in `INPUT_FORMATS`. Code outside its module never asks
 //! which format an input has.
 
 pub mod archive;
@@ -18,6 +18,7 @@ mod iterations;
 mod linked;
 pub(crate) mod motion_model;
 mod native_4d_gaussians;
+pub(crate) mod opened;
 mod ply_sequence;
 mod sc_gs;
 pub mod size;
@@ -38,32 +39,34 @@ pub use crate::models::input_model::{
 };
 use deform_folder::Arguments;
 pub use four_d_gaussians::ModelFolder;
-pub use linked::LinkedFrames;
+pub use linked::UnlinkedFrames;
+pub use opened::Opened;
 pub use size::ModelSize;
 
 use crate::error::{Error, Result, ShowPath};
 use crate::files::checkpoint::{has_legacy_magic, legacy_format};
-use crate::models::input_model::{FoundInput, ModelFormat};
+use crate::models::input_model::FoundInput;
+use crate::models::opened::InputFormat;
 
-/// Model formats that are read from files. The first entry that recognizes a path opens it.
-const MODEL_FORMATS: [ModelFormat; 17] = [
-    windowed::FTGS,
-    windowed::TSOG,
-    spacetime_gaussians::ENTRY,
-    spacetime_gaussians::SPLATV,
-    still_files::ENTRY,
-    sc_gs::ENTRY,
-    deformable_3d_gaussians::ENTRY,
-    native_4d_gaussians::ENTRY,
-    free_time_gs::ENTRY,
-    foreign::ENTRY,
-    static_3d_gaussians::ENTRY,
-    four_d_gaussians::ENTRY,
-    dynamic_3d_gaussians::ENTRY,
-    ply_sequence::FOLDER,
-    ply_sequence::FILE,
-    container::ENTRY,
-    archive::ENTRY,
+/// Formats that are read from files. The first entry that recognizes a path opens it.
+const INPUT_FORMATS: [InputFormat; 17] = [
+    InputFormat::Model(windowed::FTGS),
+    InputFormat::Model(windowed::TSOG),
+    InputFormat::Model(spacetime_gaussians::ENTRY),
+    InputFormat::Model(spacetime_gaussians::SPLATV),
+    InputFormat::Frames(still_files::ENTRY),
+    InputFormat::Model(sc_gs::ENTRY),
+    InputFormat::Model(deformable_3d_gaussians::ENTRY),
+    InputFormat::Model(native_4d_gaussians::ENTRY),
+    InputFormat::Model(free_time_gs::ENTRY),
+    InputFormat::Model(foreign::ENTRY),
+    InputFormat::Model(static_3d_gaussians::ENTRY),
+    InputFormat::Model(four_d_gaussians::ENTRY),
+    InputFormat::Model(dynamic_3d_gaussians::ENTRY),
+    InputFormat::Frames(ply_sequence::FOLDER),
+    InputFormat::Model(ply_sequence::FILE),
+    InputFormat::Frames(container::ENTRY),
+    InputFormat::Model(archive::ENTRY),
 ];
 
 /// Returns white if the model in the folder `cameras`, or in the folder of the file `cameras`, was trained with a white
@@ -76,18 +79,19 @@ pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
 }
 
 /// Opens the model, frames or container at `path`, whose format is recognized by its content. Models that are
-/// continuous in time have no frames until [`InputModel::with_times`] is called.
+/// continuous in time have no frames until [`InputModel::with_times`] is called. Frames that do not identify Gaussians
+/// are not linked yet.
 ///
 /// # Errors
 /// Fails if the path does not exist, has no known format, or holds a damaged file.
-pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+pub fn open(path: &Path, options: &OpenOptions) -> Result<Opened> {
     let found = FoundInput::new(path, options.memory)?;
     let is_folder = found.is_folder;
     if is_folder {
         refuse_inside_a_model(path)?;
     }
-    match MODEL_FORMATS.iter().find(|entry| (entry.recognizes)(&found)) {
-        Some(entry) => (entry.open)(path, options),
+    match INPUT_FORMATS.iter().find(|format| format.recognizes(&found)) {
+        Some(format) => format.open(path, options),
         None if is_folder => Err(unrecognized::unrecognized_folder(path)),
         None if has_legacy_magic(&found.head) => Err(legacy_format(path)),
         None => Err(unrecognized::unrecognized_file(path)),

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::archive::files::add_cloud;
-use super::linked::LinkedFrames;
+use super::linked::UnlinkedFrames;
 use super::size::bytes_read_for;
 use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
 use crate::archive::ArchiveContent;
@@ -22,6 +22,7 @@ use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
 use crate::model::{Attributes, Gaussians};
 use crate::models::input_model::{InputModel, LinkMode, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::opened::{FrameFormat, Opened};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{FramesInMemory, gather_all};
@@ -29,8 +30,8 @@ use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, compare_order};
 
-/// Model format of frames in PLY files: recognizes and opens a folder with one PLY file per frame.
-pub(super) const FOLDER: ModelFormat = ModelFormat {
+/// Format of frames in PLY files: recognizes and opens a folder with one PLY file per frame.
+pub(super) const FOLDER: FrameFormat = FrameFormat {
     recognizes: |found| found.is_folder && has_ply(found.path),
     open: |path, options| {
         let by = if options.allow_gaps { PlyFrames::open_with_gaps } else { PlyFrames::open };
@@ -49,26 +50,27 @@ fn has_ply(folder: &Path) -> bool {
 /// Model format of a single PLY file: recognizes and opens the file, which becomes the only frame.
 pub(super) const FILE: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply"),
-    open: |path, options| open_frames(PlyFrames::open_single(path, &options.ply())?, path, options),
+    open: |path, options| {
+        options.refuse_for(path)?;
+        Ok(Box::new(PlySequence::new(PlyFrames::open_single(path, &options.ply())?)?))
+    },
 };
 
-/// Opens the PLY frames `frames`, which were found at `path`. Links them (matches their Gaussians between frames) if
-/// `options` request this, or if the same index does not mean the same Gaussian in all frames.
-pub(super) fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+/// Opens the PLY frames `frames`, which were found at `path`. They have to be linked (their Gaussians matched between
+/// frames) if `options` request this, or if the same index does not mean the same Gaussian in all frames.
+pub(super) fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Opened> {
     options.refuse_for(path)?;
     let order = match options.link {
         _ if frames.paths().len() == 1 => FrameOrder::Assumed,
-        link if link.links_frames_always() => FrameOrder::Lost("as requested".to_owned()),
+        link if link.links_frames_always() => FrameOrder::Lost(LinkMode::REQUESTED.to_owned()),
         LinkMode::Auto => measure_order(&frames)?,
         _ => FrameOrder::Assumed,
     };
-    match order {
-        FrameOrder::Assumed => Ok(Box::new(PlySequence::new(frames)?)),
-        FrameOrder::Confirmed(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
-        FrameOrder::Lost(why) => {
-            Ok(Box::new(LinkedFrames::open(frames, path, &why, options.link.joins_tracks(), &options.ply())?))
-        }
-    }
+    Ok(match order {
+        FrameOrder::Assumed => Opened::Model(Box::new(PlySequence::new(frames)?)),
+        FrameOrder::Confirmed(note) => Opened::Model(Box::new(PlySequence::new(frames)?.with_note(note))),
+        FrameOrder::Lost(why) => Opened::Unlinked(Box::new(UnlinkedFrames::from_files(frames, path, why, options))),
+    })
 }
 
 /// Maximum number of pairs of neighboring frames that are compared to find whether their Gaussians have a common order.

@@ -196,7 +196,10 @@ mod tests {
             write_inria(&made, &[], &cloud.join("point_cloud.ply")).unwrap();
         }
         fs::write(root.join("cfg_args"), "Namespace(sh_degree=3)").unwrap();
-        let open = |path: &Path, iteration| models::open(path, &OpenOptions { iteration, ..OpenOptions::default() });
+        let open = |path: &Path, iteration| {
+            models::open(path, &OpenOptions { iteration, ..OpenOptions::default() })
+                .and_then(models::Opened::into_linked)
+        };
         let model = open(&root, None).unwrap();
         assert_eq!((model.kind(), model.default_output_kind()), ("3D Gaussian Splatting model", OutputKind::Model));
         let result = folder.path().join("result");

@@ -28,7 +28,8 @@ use crate::files::spz;
 use crate::files::spz::read::read_spz;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
-use crate::models::input_model::{FoundInput, InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::input_model::{FoundInput, InputModel, MemoryProfile, OpenOptions, TimeOrigin};
+use crate::models::opened::{FrameFormat, Opened};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::FrameSource;
@@ -92,13 +93,13 @@ fn has_packed_positions(input: &FoundInput) -> bool {
         && (has("\nelement chunk ") || has(compressed_ply::MARKER_PROPERTY))
 }
 
-/// Model format of the files of web viewers: recognizes and opens one file, or a folder with one file per frame.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+/// Format of the files of web viewers: recognizes and opens one file, or a folder with one file per frame.
+pub(super) const ENTRY: FrameFormat = FrameFormat {
     recognizes: |found| format_of(found).is_some(),
     open: |path, options| {
         let found = FoundInput::new(path, options.memory)?;
         let format = format_of(&found).ok_or_else(|| Error::internal("the input has changed its format"))?;
-        Ok(Box::new(StillFiles::open(path, format, options)?))
+        StillFiles::open(path, format, options)
     },
 };
 
@@ -131,7 +132,7 @@ struct StillFiles {
 impl StillFiles {
     /// Decodes the file at `path`, or the files in the folder at `path`, and opens the decoded frames. Fails if a file
     /// cannot be decoded or if the SH degree differs between frames.
-    fn open(path: &Path, format: &'static StillFormat, options: &OpenOptions) -> Result<StillFiles> {
+    fn open(path: &Path, format: &'static StillFormat, options: &OpenOptions) -> Result<Opened> {
         options.refuse_for(path)?;
         let is_sequence = path.is_dir() && !path.join("meta.json").is_file();
         let paths = match is_sequence {
@@ -151,8 +152,8 @@ impl StillFiles {
             write_inria(&gaussians, &[], &scratch.path().join(format!("frame_{frame:05}.ply")))?;
         }
         let frames = PlyFrames::open(scratch.path(), &options.ply())?;
-        let inner = open_frames(frames, path, options)?;
-        Ok(StillFiles { inner, scratch, paths, kind: format.kind })
+        let opened = open_frames(frames, path, options)?;
+        Ok(opened.wrapped(|inner| Box::new(StillFiles { inner, scratch, paths, kind: format.kind })))
     }
 }
 

@@ -21,20 +21,21 @@ use crate::journal::{Journal, Stopwatch};
 use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload, format_bytes};
 use crate::model::RobustBox;
 use crate::model::{Camera, FrameView, Rig, Split, ViewSchedule};
+use crate::models::Opened;
 use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
 use crate::passes::{FramesInMemory, ViewSampler};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::{Measured, MeasuredOnArrival};
 use crate::pipeline::stages::measure::MeasureStages;
-use crate::pipeline::stages::quality;
+use crate::pipeline::stages::{quality, track};
 use crate::pipeline::throughput::forecast;
 use crate::progress::Message;
 use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
 use crate::scene::{
-    FrameQuota, InputOptions, OpenedInput, Scene, from_input, is_linked, link_stream, load_cameras, open_scene,
-    open_stream, receiving_estimate,
+    FrameQuota, InputOptions, OpenedInput, Scene, UntrackedInput, from_input, is_linked, load_cameras, open_stream,
+    open_untracked, receive_unlinked, receiving_estimate,
 };
 use crate::source::{FrameSource, ReadCounts};
 use crate::statistics::ScanPlan;
@@ -44,7 +45,7 @@ use crate::statistics::pass::RunningScan;
 /// within the memory budget. The function `plan` makes the plan of the run from facts about the scene. It is called at
 /// a time that depends on the input:
 /// - stream: before any frame is read;
-/// - stream whose Gaussians have to be matched between frames ([`is_linked`]): after all frames are read;
+/// - frames whose Gaussians have to be linked: after the stage [`track`], which finds how many Gaussians there are;
 /// - other input: after it is opened.
 ///
 /// Returns the scene and the plan of the run. Also returns the statistics of the Gaussians if the input is a stream and
@@ -57,8 +58,8 @@ pub fn open_to_measure(
     plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
     journal: &mut Journal,
 ) -> Result<(Scene, RunPlan, Option<Measured>)> {
-    let start = Stopwatch::start();
-    let mut scene = if options.is_stream() {
+    let mut start = Stopwatch::start();
+    let opened = if options.is_stream() {
         let normalized = cameras::TimeConvention::Normalized;
         let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalized, None)?;
         let stream = open_stream(options)?;
@@ -68,10 +69,11 @@ pub fn open_to_measure(
             journal.record_opening("receive", start, scene.source().info().count, ReadCounts::default());
             return Ok((scene, stages, measured));
         }
-        from_input(link_stream(stream, options, rig)?, options)?
+        UntrackedInput::with_own_times(Opened::Unlinked(Box::new(receive_unlinked(stream, options)?)), rig)
     } else {
-        open_scene(options)?
+        open_untracked(options)?
     };
+    let mut scene = from_input(track::run(opened, options, &mut start, journal)?, options)?;
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
     scene.add_outside_views(stages.measure.scan.recipe.outside);
     let plan = MemoryPlan::fit_budget(scene.workload(), options.memory, &options.events, |work, limits| {

@@ -227,7 +227,8 @@ fn explicit_frames_improve_along_time_in_every_output() {
     for (name, path, link) in
         [("packed", &packed, LinkMode::Never), ("files", &files, LinkMode::Never), ("linked", &files, LinkMode::Apart)]
     {
-        let input = crate::models::open(path, &OpenOptions { link, ..OpenOptions::default() }).unwrap();
+        let input =
+            crate::models::open(path, &OpenOptions { link, ..OpenOptions::default() }).unwrap().into_linked().unwrap();
         let scene = Scene::new(path.clone(), input, demo.rig(), Some(Split::Train)).unwrap();
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
@@ -277,7 +278,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
             }
             scene.input.write(&varying, kind, &out, &Limits::NONE, &Events::IGNORED).unwrap();
             let options = OpenOptions { link: LinkMode::Never, ..OpenOptions::default() };
-            let written = crate::models::open(&out, &options).unwrap();
+            let written = crate::models::open(&out, &options).unwrap().into_linked().unwrap();
             assert!(read(written.source()) == expected, "{name} as {kind:?}");
         }
     }

@@ -17,7 +17,7 @@ const TIME_TOLERANCE: f64 = 1e-6;
 /// Fails if the model cannot be read, or if the number or the times of its frames differ from the original's.
 pub fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
     let times = &original.source().info().times;
-    let input = models::open(path, &OpenOptions { iteration: None, ..options.open_options() })?;
+    let input = models::open(path, &OpenOptions { iteration: None, ..options.open_options() })?.into_linked()?;
     let input = match input.timing() {
         TimeOrigin::Continuous => input.with_times(times.clone())?,
         TimeOrigin::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,

@@ -10,7 +10,7 @@ use crate::files::cameras::{CameraOptions, TimeConvention, TimesSource};
 use crate::memory_plan::Budget;
 use crate::model::{Rig, Split};
 use crate::models;
-use crate::models::{InputModel, LinkMode, OpenOptions, TrainingConventions};
+use crate::models::{InputModel, LinkMode, OpenOptions, Opened, TrainingConventions};
 use crate::progress::Events;
 
 /// Options for opening an input (a model, a sequence of frames or a frame stream) together with its cameras.
@@ -115,6 +115,57 @@ pub struct OpenedInput {
     pub rig: Option<Rig>,
     /// Notes about the input to show to the user.
     pub notes: Vec<String>,
+}
+
+impl OpenedInput {
+    /// Returns this input if it has frames or no Gaussians. `path` is the input in messages.
+    ///
+    /// # Errors
+    /// Fails if the input has Gaussians but no frame.
+    pub(super) fn with_frames(self, path: &Path) -> Result<OpenedInput> {
+        let info = self.input.source().info();
+        if info.times.is_empty() && info.count > 0 {
+            let found = format!("no frame, but {} Gaussians", info.count);
+            return Err(Error::input(path, "", "at least one frame", found));
+        }
+        Ok(self)
+    }
+}
+
+/// Opened input whose Gaussians may still have to be linked into tracks (Gaussians followed through frames), together
+/// with its cameras if it has any.
+pub struct UntrackedInput {
+    /// Model, or frames that are not linked yet.
+    pub opened: Opened,
+    /// Cameras given by the user or found with the input.
+    pub rig: Option<Rig>,
+    /// Times that the frames get instead of their own; `None` if they keep their own.
+    pub times: Option<Vec<f64>>,
+    /// Notes about the input to show to the user.
+    pub notes: Vec<String>,
+}
+
+impl UntrackedInput {
+    /// Returns the input `opened` whose frames keep their times, with the cameras `rig`.
+    pub fn with_own_times(opened: Opened, rig: Option<Rig>) -> UntrackedInput {
+        UntrackedInput { opened, rig, times: None, notes: Vec::new() }
+    }
+
+    /// Returns the input with the times of its frames. Frames that are not linked yet are linked first, which reads all
+    /// of them and renders some. `path` is the input in messages.
+    ///
+    /// # Errors
+    /// Fails if the frames cannot be linked, if the times do not increase, or if an input with Gaussians has no frame.
+    pub fn track(self, path: &Path) -> Result<OpenedInput> {
+        let UntrackedInput { opened, rig, times, notes } = self;
+        let mut input = opened.into_linked()?;
+        if let Some(times) = times {
+            input = input.with_times(times)?;
+        }
+        // Some notes of the input depend on the times of its frames.
+        let notes = [input.notes(), notes].concat();
+        OpenedInput { input, rig, notes }.with_frames(path)
+    }
 }
 
 /// Loads the cameras from the file or folder `path`; returns `None` if `path` is `None`. `times` states where the times

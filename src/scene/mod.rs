@@ -26,9 +26,9 @@ use crate::source::ReadCounts;
 
 use absent::Absent;
 pub use compressed::open_compressed;
-pub use input::{InputOptions, OpenedInput, load_cameras};
-pub use open::{first_frame_box, from_input, open_input, open_scene, scratch_beside};
-pub use stream::{FrameQuota, frame_quota, is_linked, link_stream, open_stream, receiving_estimate};
+pub use input::{InputOptions, OpenedInput, UntrackedInput, load_cameras};
+pub use open::{first_frame_box, from_input, open_input, open_scene, open_untracked, scratch_beside};
+pub use stream::{FrameQuota, frame_quota, is_linked, open_stream, receive_unlinked, receiving_estimate};
 pub(crate) use work::add_file_stamps;
 pub use work::open_cache;
 

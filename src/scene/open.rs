@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use super::Scene;
-use super::input::{InputOptions, OpenedInput, load_cameras};
+use super::input::{InputOptions, OpenedInput, UntrackedInput, load_cameras};
 use super::stream::open_packed_stream;
 use super::view_selection::no_view_error;
 use crate::error::{Error, Result, ShowPath};
@@ -14,42 +14,48 @@ use crate::files::cameras::{TimeConvention, TimesSource};
 use crate::model::RobustBox;
 use crate::model::{Attributes, Rig, opacity};
 use crate::models;
-use crate::models::{InputModel, TimeOrigin};
+use crate::models::{InputModel, Opened, TimeOrigin};
 use crate::passes::gather_all;
 use crate::progress::Message;
 use crate::source::FrameSource;
 
 /// Opens an input, and loads its cameras if it has any. If the input does not state the times of its frames, the times
-/// of the cameras' views are used.
+/// of the cameras' views are used. Frames that do not identify Gaussians are linked into tracks (Gaussians followed
+/// through frames).
+///
+/// # Errors
+/// Fails as [`open_untracked`] does, and if the frames cannot be linked.
+pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
+    open_untracked(options)?.track(&options.path)
+}
+
+/// Opens an input, and loads its cameras if it has any, like [`open_input`], but links no frames.
 ///
 /// # Errors
 /// Fails if the input or the cameras are invalid, if the cameras belong to a sequence with other frames, or if an
 /// option does not apply to the input.
-pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
+pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
     options.check_folders()?;
     if options.is_stream() {
-        return check_frames(open_packed_stream(options)?, &options.path);
+        return open_packed_stream(options);
     }
     let path = &options.path;
     let mut notes = Vec::new();
-    let input = models::open(path, &options.open_options())?;
-    let rig = load_input_cameras(options, &*input)?;
+    let opened = models::open(path, &options.open_options())?;
+    let rig = load_input_cameras(options, &opened)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
-    let input = match input.timing() {
-        TimeOrigin::Continuous => {
-            let times = match options.frames {
-                None if !times.is_empty() => times,
-                // The given number of frames equals the number of the cameras' times, so these times are used.
-                Some(frames) if frames == times.len() => times,
-                given => evenly_spaced(given, input.duration(), &mut notes)?,
-            };
-            input.with_times(times)?
-        }
+    let times = match opened.timing() {
+        TimeOrigin::Continuous => Some(match options.frames {
+            None if !times.is_empty() => times,
+            // The given number of frames equals the number of the cameras' times, so these times are used.
+            Some(frames) if frames == times.len() => times,
+            given => evenly_spaced(given, opened.model().map_or(1.0, InputModel::duration), &mut notes)?,
+        }),
         _ if options.frames.is_some() => {
             return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.shown())));
         }
         TimeOrigin::Numbered if !times.is_empty() => {
-            let found = input.source().info().times.len();
+            let found = opened.times().len();
             if times.len() != found {
                 return Err(Error::usage(format!(
                     "{}: {found} frames, but the cameras of {} have {} distinct times\n  give the cameras of this sequence",
@@ -58,33 +64,32 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
                     times.len()
                 )));
             }
-            input.with_times(times)?
+            Some(times)
         }
-        TimeOrigin::Numbered | TimeOrigin::Stamped => input,
+        TimeOrigin::Numbered | TimeOrigin::Stamped => None,
     };
-    // Some notes of the input depend on the times of its frames.
-    let notes = [input.notes(), notes].concat();
-    check_frames(OpenedInput { input, rig, notes }, path)
+    Ok(UntrackedInput { opened, rig, times, notes })
 }
 
-/// Loads the cameras that `options` name, or else the cameras found with `input`. Returns `None` if there are neither.
-/// The times in a camera file may be normalized or on the scale of the frames' time stamps:
+/// Loads the cameras that `options` name, or else the cameras found with the input `opened`. Returns `None` if there
+/// are neither. The times in a camera file may be normalized or on the scale of the frames' time stamps:
 /// - First, they are read in the time convention of the input.
 /// - If the frames of the input have time stamps and the resulting times are not among them, the times as stated in the
 ///   file are tried. They are used if they are among the time stamps.
-fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
-    let path = camera_path(options, input);
+fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<Rig>> {
+    let (model, timing, frame_times) = (opened.model(), opened.timing(), opened.times());
+    let path = camera_path(options, model);
     // Numbers in the image names of a still scene are not times.
-    let is_still = input.timing() != TimeOrigin::Continuous && input.source().info().times.len() == 1;
+    let is_still = timing != TimeOrigin::Continuous && frame_times.len() == 1;
     let by_name = path.as_deref().is_some_and(cameras::are_timed_by_name);
     let times = match options.times {
         TimesSource::Own if is_still && by_name => TimesSource::None,
         _ => options.times.clone(),
     };
-    let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, Some(input));
-    let rig = load(input.time_convention())?;
-    let fits = |rig: &Rig| rig.schedule(&input.source().info().times, options.split).is_ok();
-    match rig.as_ref().is_some_and(|rig| input.timing() == TimeOrigin::Stamped && !fits(rig)) {
+    let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, model);
+    let rig = load(model.map_or(TimeConvention::Normalized, InputModel::time_convention))?;
+    let fits = |rig: &Rig| rig.schedule(&frame_times, options.split).is_ok();
+    match rig.as_ref().is_some_and(|rig| timing == TimeOrigin::Stamped && !fits(rig)) {
         true => Ok(load(TimeConvention::Given)?.filter(fits).or(rig)),
         false => Ok(rig),
     }
@@ -107,15 +112,6 @@ fn evenly_spaced(requested: Option<usize>, span: f64, notes: &mut Vec<String>) -
         ));
     }
     Ok((0..frames).map(|i| span * i as f64 / frames as f64).collect())
-}
-
-fn check_frames(opened: OpenedInput, path: &Path) -> Result<OpenedInput> {
-    let info = opened.input.source().info();
-    if info.times.is_empty() && info.count > 0 {
-        let found = format!("no frame, but {} Gaussians", info.count);
-        return Err(Error::input(path, "", "at least one frame", found));
-    }
-    Ok(opened)
 }
 
 /// Opens an input together with its cameras.
@@ -149,7 +145,7 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
 /// # Errors
 /// Fails if the cameras belong to another scene, or if the split has no views.
 pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> {
-    let OpenedInput { input, rig, mut notes } = check_frames(opened, &options.path)?;
+    let OpenedInput { input, rig, mut notes } = opened.with_frames(&options.path)?;
     // A stream's number of frames is unknown when its run is planned, so a stream never counts as a scene without
     // motion.
     let is_still = !options.is_stream() && input.source().info().times.len() == 1;
@@ -188,8 +184,8 @@ const DEFAULT_FRAMES: usize = 60;
 /// Maximum number of frames at which a model is evaluated. Each takes 8 bytes of memory before any work starts.
 const MAX_FRAMES: usize = 1_000_000;
 
-fn camera_path(options: &InputOptions, input: &dyn InputModel) -> Option<PathBuf> {
-    options.cameras.clone().or_else(|| cameras::find_training_cameras(input.data_folder()?, &options.path))
+fn camera_path(options: &InputOptions, model: Option<&dyn InputModel>) -> Option<PathBuf> {
+    options.cameras.clone().or_else(|| cameras::find_training_cameras(model?.data_folder()?, &options.path))
 }
 
 /// Returns a rig of virtual cameras (placed by the program) all around the surface of a scene with only one frame.

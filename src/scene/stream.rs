@@ -4,7 +4,7 @@
 use std::io::{IsTerminal, Stdin};
 use std::path::Path;
 
-use super::input::{InputOptions, OpenedInput, load_cameras};
+use super::input::{InputOptions, UntrackedInput, load_cameras};
 use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
@@ -13,7 +13,7 @@ use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, Rig};
 use crate::models::MemoryProfile;
 use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
-use crate::models::{InputModel, LinkedFrames};
+use crate::models::{Opened, UnlinkedFrames};
 use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::statistics;
 
@@ -42,21 +42,21 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
-/// Opens the stream on standard input together with its cameras. The Gaussians of its frames are linked into tracks
-/// (Gaussians followed through frames) if [`is_linked`] says so; otherwise the frames are packed into a temporary
-/// container.
+/// Opens the stream on standard input together with its cameras. The stream is received completely. Its Gaussians still
+/// have to be linked into tracks (Gaussians followed through frames) if [`is_linked`] says so.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
 /// that the container stores together).
-pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> {
+pub(super) fn open_packed_stream(options: &InputOptions) -> Result<UntrackedInput> {
     let rig =
         load_cameras(options, options.cameras.as_deref(), options.times.clone(), TimeConvention::Normalized, None)?;
     let stream = open_stream(options)?;
-    if is_linked(stream.header(), options) {
-        return link_stream(stream, options, rig);
-    }
-    Ok(OpenedInput { input: Box::new(pack_stream(stream, options)?), rig, notes: Vec::new() })
+    let opened = match is_linked(stream.header(), options) {
+        true => Opened::Unlinked(Box::new(receive_unlinked(stream, options)?)),
+        false => Opened::Model(Box::new(pack_stream(stream, options)?)),
+    };
+    Ok(UntrackedInput::with_own_times(opened, rig))
 }
 
 /// Packs a stream of frames into a temporary container file and opens this file.
@@ -77,27 +77,18 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
     header.is_unlinked || options.link.links_frames_always()
 }
 
-/// Receives a stream of frames and links their Gaussians into tracks (Gaussians followed through frames). Only for
-/// streams for which [`is_linked`] returns true. Returns the input together with the cameras `rig`.
+/// Receives a stream of frames whose Gaussians are to be linked into tracks (Gaussians followed through frames). Only for
+/// streams for which [`is_linked`] returns true.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
 /// that the container stores together).
-pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<OpenedInput> {
-    let joins = options.link.joins_tracks();
-    let input = match stream.header().is_unlinked {
-        true => {
-            LinkedFrames::receive_and_link(stream, Path::new(STANDARD_INPUT), joins, &options.open_options().ply())?
-        }
-        false => LinkedFrames::relink(
-            &pack_stream(stream, options)?,
-            "linked frame stream",
-            joins,
-            &options.open_options().ply(),
-        )?,
-    };
-    let notes = input.notes();
-    Ok(OpenedInput { input: Box::new(input), rig, notes })
+pub fn receive_unlinked(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<UnlinkedFrames> {
+    let open = options.open_options();
+    match stream.header().is_unlinked {
+        true => UnlinkedFrames::receive(stream, Path::new(STANDARD_INPUT), &open),
+        false => Ok(UnlinkedFrames::from_model(Box::new(pack_stream(stream, options)?), "linked frame stream", &open)),
+    }
 }
 
 /// Returns the quota for the frames of a stream with the header `header`: a counter of arriving frames, which fails as

@@ -56,7 +56,8 @@ fn splat_transform(workplace: &Workplace, from: &str, to: &str, options: &[&str]
 }
 
 fn read(path: &Path) -> Gaussians {
-    gather_all(open(path, &OpenOptions::default()).unwrap().source(), 0, Attributes::all()).unwrap()
+    gather_all(open(path, &OpenOptions::default()).unwrap().into_linked().unwrap().source(), 0, Attributes::all())
+        .unwrap()
 }
 
 /// Returns the Gaussians sorted by their x coordinates, so that two files with other orders can be compared.

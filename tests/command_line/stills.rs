@@ -63,7 +63,7 @@ fn the_index_map_follows_the_order_of_a_sog() {
     let workplace = Workplace::new();
     let made = write_ply(&workplace, "still.ply");
     workplace.done("compress still.ply -o small.sog --count 20 --no-refine --prune-only --quiet");
-    let found = open(&workplace.path("small.sog"), &OpenOptions::default()).unwrap();
+    let found = open(&workplace.path("small.sog"), &OpenOptions::default()).unwrap().into_linked().unwrap();
     let found = gather_all(found.source(), 0, Attributes::POSITION).unwrap();
     let map = index_map(&workplace.path("small.sog.index_map.npy"));
     assert_eq!(map.iter().filter(|place| **place >= 0).count(), 20);
@@ -95,7 +95,7 @@ fn attributes_survive_every_format_within_a_step() {
     places.sort_by(|a, b| a[0].total_cmp(&b[0]));
     for name in ["a.sog", "a.spz"] {
         workplace.done(&format!("convert still.ply {name}"));
-        let found = open(&workplace.path(name), &OpenOptions::default()).unwrap();
+        let found = open(&workplace.path(name), &OpenOptions::default()).unwrap().into_linked().unwrap();
         let found = gather_all(found.source(), 0, Attributes::all()).unwrap();
         let mut read: Vec<[f32; 3]> = (0..found.len()).map(|i| found.position.row(i)).collect();
         read.sort_by(|a, b| a[0].total_cmp(&b[0]));

@@ -73,7 +73,8 @@ fn archive_reads_like_the_folder_it_unpacks_to() {
     let (workplace, _) = with_archive();
     workplace.done("convert small.gsz small");
     let folder = model(&workplace.path("small"));
-    let archive = splatsieve::models::open(&workplace.path("small.gsz"), &Default::default()).unwrap();
+    let archive =
+        splatsieve::models::open(&workplace.path("small.gsz"), &Default::default()).unwrap().into_linked().unwrap();
     assert_eq!(archive.kind(), "gsz archive");
     let archive = archive.with_times(vec![0.0, 0.4, 1.0]).unwrap();
     for frame in 0..3 {
@@ -140,7 +141,9 @@ fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
     let psnr = found["psnr"].as_f64().unwrap_or_else(|| panic!("{found}"));
     assert!((44.0..48.0).contains(&psnr), "{psnr} dB");
     // Every value is within the bound that the summary names.
-    let open = |name: &str| splatsieve::models::open(&workplace.path(name), &Default::default()).unwrap();
+    let open = |name: &str| {
+        splatsieve::models::open(&workplace.path(name), &Default::default()).unwrap().into_linked().unwrap()
+    };
     let [before, after] = ["exact.gseq", "small.gsz"].map(open);
     assert_eq!(after.kind(), "gseq container");
     for frame in [0, 7, 19] {

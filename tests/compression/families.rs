@@ -15,7 +15,7 @@ use splatsieve::recipe::{FieldPrecision, Recipe};
 
 /// Opens the model at `path`. If the model has no times of its own, gives it three times.
 fn open(path: &Path) -> Box<dyn InputModel> {
-    let input = models::open(path, &OpenOptions::default()).unwrap();
+    let input = models::open(path, &OpenOptions::default()).unwrap().into_linked().unwrap();
     if input.source().info().times.is_empty() { input.with_times(vec![0.0, 0.25, 1.0]).unwrap() } else { input }
 }
 

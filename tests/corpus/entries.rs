@@ -327,7 +327,7 @@ fn colmap(bytes: &[u8], folder: &InputFolder) -> Outcome {
 
 /// Opens a model of any format and reads its first and last frame. A model without times of its own gets two times.
 fn model(path: &Path) -> Outcome {
-    let mut model = models::open(path, &OpenOptions::default())?;
+    let mut model = models::open(path, &OpenOptions::default())?.into_linked()?;
     if model.source().info().times.is_empty() {
         model = model.with_times(vec![0.0, 0.5])?;
     }
@@ -378,7 +378,7 @@ fn still(name: &str, bytes: &[u8], folder: &InputFolder) -> Outcome {
         scratch: Some(folder.0.path().to_owned()),
         ..OpenOptions::default()
     };
-    read_first_and_last_frame(models::open(&path, &options)?.source())
+    read_first_and_last_frame(models::open(&path, &options)?.into_linked()?.source())
 }
 
 fn pickle(bytes: &[u8], folder: &InputFolder) -> Outcome {

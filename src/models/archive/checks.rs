@@ -56,7 +56,9 @@ pub(in crate::models) fn check_round_trip(
     let kind = restored_output_kind(&decoded, &file).unwrap().expect("a layout");
 
     let times = &model.source().info().times;
-    let open = |path: &Path| crate::models::open(path, options).unwrap().with_times(times.clone()).unwrap();
+    let open = |path: &Path| {
+        crate::models::open(path, options).unwrap().into_linked().unwrap().with_times(times.clone()).unwrap()
+    };
     let restored =
         folder.path().join(if kind == OutputKind::Model { "back".into() } else { format!("back.{}", extension(kind)) });
     if kind == OutputKind::Model {

@@ -109,7 +109,11 @@ impl TestModel {
 
     fn message(&self) -> String {
         self.write(7);
-        models::open(&self.path(), &OpenOptions::default()).err().expect("it must be refused").to_string()
+        models::open(&self.path(), &OpenOptions::default())
+            .and_then(models::Opened::into_linked)
+            .err()
+            .expect("it must be refused")
+            .to_string()
     }
 
     fn row<const W: usize>(&self, prefix: &str, i: usize) -> [f64; W] {
@@ -146,7 +150,7 @@ fn cloud(features: usize) -> Vec<(String, Vec<f32>)> {
 }
 
 fn open(path: &Path) -> Result<Box<dyn InputModel>> {
-    models::open(path, &OpenOptions::default())?.with_times(TIMES.to_vec())
+    models::open(path, &OpenOptions::default())?.into_linked()?.with_times(TIMES.to_vec())
 }
 
 fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
@@ -464,7 +468,10 @@ fn iterations_need_both_folders() {
     made.write(100);
     fs::remove_file(made.file("deform", 100)).unwrap();
     made.write(30);
-    let opened = |iteration| models::open(&made.path(), &OpenOptions { iteration, ..OpenOptions::default() });
+    let opened = |iteration| {
+        models::open(&made.path(), &OpenOptions { iteration, ..OpenOptions::default() })
+            .and_then(models::Opened::into_linked)
+    };
     assert_eq!(opened(None).unwrap().digest().unwrap(), opened(Some(30)).unwrap().digest().unwrap());
     assert!(opened(Some(7)).is_ok());
     let message = opened(Some(100)).err().unwrap().to_string();

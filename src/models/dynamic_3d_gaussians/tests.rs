@@ -45,6 +45,7 @@ fn write(path: &Path, arrays: &Arrays, method: CompressionMethod) {
 
 fn open(path: &Path) -> Result<Box<dyn InputModel>> {
     models::open(path, &OpenOptions { scratch: path.parent().map(Path::to_owned), ..OpenOptions::default() })
+        .and_then(models::Opened::into_linked)
 }
 
 fn message(path: &Path) -> String {

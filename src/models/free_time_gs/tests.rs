@@ -93,7 +93,7 @@ impl ResultFolder {
 }
 
 fn open(path: &Path) -> Result<Box<dyn InputModel>> {
-    models::open(path, &OpenOptions::default())?.with_times(TIMES.to_vec())
+    models::open(path, &OpenOptions::default())?.into_linked()?.with_times(TIMES.to_vec())
 }
 
 fn states(model: &dyn InputModel) -> Vec<Gaussians> {
@@ -191,11 +191,11 @@ fn model_without_velocities_is_static_with_any_sh_degree() {
     made[5].1 = vec![3, 3];
     made[5].2.truncate(9 * COUNT);
     let folder = ResultFolder::put(&made);
-    let model = models::open(&folder.path("result"), &OpenOptions::default()).unwrap();
+    let model = models::open(&folder.path("result"), &OpenOptions::default()).unwrap().into_linked().unwrap();
     assert_eq!((model.kind(), model.source().info().sh_degree), ("gsplat checkpoint", 1));
     let whole = gather_all(model.source(), 0, Attributes::all()).unwrap();
     let result = folder.written(&*model, &CompressedModel::pruned(vec![1, 2], &rule()));
-    let left = models::open(&result, &OpenOptions::default()).unwrap();
+    let left = models::open(&result, &OpenOptions::default()).unwrap().into_linked().unwrap();
     assert_eq!(gather_all(left.source(), 0, Attributes::all()).unwrap(), whole.pick(&[1, 2]));
 }
 

@@ -1,5 +1,5 @@
-//! Links frames that the user did not give as PLY files: saves them as temporary PLY files, then matches their
-//! Gaussians across frames. There are two sources of such frames:
+//! Saves frames that the user did not give as PLY files as temporary PLY files, so that their Gaussians can be linked.
+//! There are two sources of such frames:
 //! - a frame stream without ids of Gaussians (format/STREAM.md, version 2),
 //! - an input that identifies Gaussians across frames, if the user asks to link it anew.
 //!
@@ -32,7 +32,7 @@ use crate::outputs::container::{GAUSSIAN_BLOCK, gaussian_range};
 use crate::source::{FrameSource, Ids, ReadPlan};
 
 /// Temporary PLY files of the frames received so far, and their times.
-struct ReceivedFrames {
+pub(super) struct ReceivedFrames {
     folder: ScratchFolder,
     times: Vec<f64>,
     /// Bytes of memory that the reader of the input takes, which supplies the frames.
@@ -62,100 +62,91 @@ impl ReceivedFrames {
         Ok(())
     }
 
-    /// Links the Gaussians of the received frames into tracks (Gaussians followed through frames).
-    /// - `kind`, `bytes`: name of the format of the original input, and its size in bytes.
-    /// - `name`: name of the input in messages.
-    /// - `why`: reason for linking, for notes to the user.
-    /// - `joins`: whether tracks that seem to be the same Gaussian are joined.
-    fn link(
+    /// Returns the time stamps of the received frames.
+    pub(super) fn times(&self) -> &[f64] {
+        &self.times
+    }
+
+    /// Links the Gaussians of the received frames into tracks (Gaussians followed through frames) with the function
+    /// `link`. `kind` and `bytes` are the name of the original input's format, shown to users, and its size in bytes.
+    ///
+    /// # Errors
+    /// Fails if `link` fails or the temporary files cannot be read.
+    pub(super) fn link(
         self,
         kind: &'static str,
-        name: &Path,
         bytes: u64,
-        why: &str,
-        joins: bool,
+        link: impl FnOnce(PlyFrames) -> Result<LinkedFrames>,
         options: &PlyOptions,
     ) -> Result<LinkedFrames> {
-        let linked = LinkedFrames::open(PlyFrames::open(self.folder.path(), options)?, name, why, joins, options)?;
+        let linked = link(PlyFrames::open(self.folder.path(), options)?)?;
         let memory = self.reader_bytes + 2 * self.largest_frame_bytes;
         let origin = Some(Origin { _folder: self.folder, kind, bytes, memory });
         Ok(LinkedFrames { info: linked.info.with_times(self.times)?, origin, ..linked })
     }
 }
 
-impl LinkedFrames {
-    /// Receives a whole stream, which messages call `name`, and links the Gaussians of its frames into tracks
-    /// (Gaussians followed through frames). `joins` states whether tracks that seem to be the same Gaussian are joined.
-    ///
-    /// # Errors
-    /// Fails if the stream is damaged or has no frames, or if a write fails.
-    pub fn receive_and_link(
-        mut stream: FrameStream<impl Read>,
-        name: &Path,
-        joins: bool,
-        options: &PlyOptions,
-    ) -> Result<LinkedFrames> {
-        let mut received = ReceivedFrames::new(&options.scratch, 0)?;
-        let mut state = Gaussians::zeros(0, stream.header().sh_degree);
-        let progress = options.events.counting_task("receive", "frames");
-        while let Some(time) = stream.next_frame(&mut state)? {
-            received.push(time, &state)?;
+/// Receives a whole stream, which messages call `name`. Returns its frames and the number of bytes received.
+///
+/// # Errors
+/// Fails if the stream is damaged or has no frames, or if a write fails.
+pub(super) fn receive(
+    mut stream: FrameStream<impl Read>,
+    name: &Path,
+    options: &PlyOptions,
+) -> Result<(ReceivedFrames, u64)> {
+    let mut received = ReceivedFrames::new(&options.scratch, 0)?;
+    let mut state = Gaussians::zeros(0, stream.header().sh_degree);
+    let progress = options.events.counting_task("receive", "frames");
+    while let Some(time) = stream.next_frame(&mut state)? {
+        received.push(time, &state)?;
+        progress.advance(1);
+    }
+    if received.times.is_empty() {
+        return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
+    }
+    Ok((received, stream.received_bytes()))
+}
+
+/// Saves the frames of `input`, each with the Gaussians that may be visible in it, as temporary PLY files. Which Gaussian
+/// is which in the input is lost.
+///
+/// # Errors
+/// Fails if a frame cannot be read or a write fails.
+pub(super) fn unpack_visible(input: &dyn InputModel, options: &PlyOptions) -> Result<ReceivedFrames> {
+    let (source, info) = (input.source(), input.source().info());
+    let visible_rows = count_visible_rows(source)?;
+    let state = state_bytes(info.sh_degree, Attributes::all());
+    let profile = input.memory_profile();
+    let tile = profile.gaussian_block.min(info.count as u64) * profile.frame_block;
+    let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Attributes::SH));
+    let unpacked = TOGETHER_BYTES.min(state * visible_rows.iter().sum::<u64>());
+    let mut received =
+        ReceivedFrames::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
+    let progress = options.events.task("unpack", "frames", info.times.len() as u64);
+    let mut start = 0;
+    while start < visible_rows.len() {
+        let mut bytes = 0;
+        let more = visible_rows[start..].iter().take_while(|&&visible_rows| {
+            bytes += state * visible_rows;
+            bytes <= TOGETHER_BYTES
+        });
+        let together = start..start + more.count().max(1);
+        start = together.end;
+        let blocks = unpack(source, together.clone())?;
+        for (at, frame) in together.enumerate() {
+            let mut whole = Gaussians::zeros(visible_rows[frame] as usize, info.sh_degree);
+            let mut first = 0;
+            for block in &blocks {
+                whole.write_rows(first, &block[at]);
+                first += block[at].len();
+            }
+            received.push(info.times[frame], &whole)?;
             progress.advance(1);
         }
-        drop(progress);
-        if received.times.is_empty() {
-            return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
-        }
-        let why = "the stream does not say which Gaussian is which";
-        received.link("linked frame stream", name, stream.received_bytes(), why, joins, options)
     }
-
-    /// Links the Gaussians of the frames of `input` anew into tracks (Gaussians followed through frames), ignoring
-    /// which Gaussian is which in the input. Each frame consists of the Gaussians that may be visible in it. `joins`
-    /// states whether tracks that seem to be the same Gaussian are joined. `kind` is the name of the input format.
-    ///
-    /// # Errors
-    /// Fails if a frame cannot be read or a write fails.
-    pub fn relink(
-        input: &dyn InputModel,
-        kind: &'static str,
-        joins: bool,
-        options: &PlyOptions,
-    ) -> Result<LinkedFrames> {
-        let (source, info) = (input.source(), input.source().info());
-        let visible_rows = count_visible_rows(source)?;
-        let state = state_bytes(info.sh_degree, Attributes::all());
-        let profile = input.memory_profile();
-        let tile = profile.gaussian_block.min(info.count as u64) * profile.frame_block;
-        let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Attributes::SH));
-        let unpacked = TOGETHER_BYTES.min(state * visible_rows.iter().sum::<u64>());
-        let mut received =
-            ReceivedFrames::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
-        let progress = options.events.task("unpack", "frames", info.times.len() as u64);
-        let mut start = 0;
-        while start < visible_rows.len() {
-            let mut bytes = 0;
-            let more = visible_rows[start..].iter().take_while(|&&visible_rows| {
-                bytes += state * visible_rows;
-                bytes <= TOGETHER_BYTES
-            });
-            let together = start..start + more.count().max(1);
-            start = together.end;
-            let blocks = unpack(source, together.clone())?;
-            for (at, frame) in together.enumerate() {
-                let mut whole = Gaussians::zeros(visible_rows[frame] as usize, info.sh_degree);
-                let mut first = 0;
-                for block in &blocks {
-                    whole.write_rows(first, &block[at]);
-                    first += block[at].len();
-                }
-                received.push(info.times[frame], &whole)?;
-                progress.advance(1);
-            }
-        }
-        drop(progress);
-        received.link(kind, Path::new(kind), input.bytes()?, "as requested", joins, options)
-    }
+    drop(progress);
+    Ok(received)
 }
 
 /// Returns the blocks of consecutive Gaussians of `source`, as ranges of indices, for reading in parallel.

@@ -17,6 +17,7 @@ mod memory;
 mod simplify;
 mod steady;
 mod tracks;
+mod unlinked;
 mod write;
 
 use std::path::{Path, PathBuf};
@@ -24,6 +25,7 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_128;
 
 use self::tracks::LinkedTracks;
+pub use self::unlinked::UnlinkedFrames;
 use super::size::bytes_read_for;
 use super::trajectories::write_trajectories;
 use crate::compressed_model::CompressedModel;
@@ -40,8 +42,8 @@ use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadCounts, ReadPlan};
 use crate::tracking::Joiner;
 
-/// Opened frames whose Gaussians have been linked into tracks (Gaussians followed through frames).
-pub struct LinkedFrames {
+/// Frames whose Gaussians have been linked into tracks (Gaussians followed through frames).
+struct LinkedFrames {
     tracks: LinkedTracks,
     /// Temporary container with the state of every track (Gaussian followed through frames) at every frame.
     container: Container,
@@ -76,13 +78,7 @@ impl LinkedFrames {
     /// # Errors
     /// Fails if a frame cannot be read or has changed meanwhile, if linking needs more memory than `options` allow, or
     /// if a write fails.
-    pub(super) fn open(
-        frames: PlyFrames,
-        name: &Path,
-        why: &str,
-        joins: bool,
-        options: &PlyOptions,
-    ) -> Result<LinkedFrames> {
+    fn new(frames: PlyFrames, name: &Path, why: &str, joins: bool, options: &PlyOptions) -> Result<LinkedFrames> {
         let scratch = &*options.scratch;
         let not_read = frames.frame(0)?.header_notes();
         let mut joiner = joins.then(Joiner::default);

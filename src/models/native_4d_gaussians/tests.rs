@@ -113,7 +113,9 @@ impl CheckpointFolder {
 fn open_as(path: &Path, rot4d_unflipped: bool) -> Result<Box<dyn InputModel>> {
     let conventions =
         TrainingConventions { time_duration: Some(2.0), rot4d_unflipped, ..TrainingConventions::default() };
-    models::open(path, &OpenOptions { conventions, ..OpenOptions::default() })?.with_times(TIMES.to_vec())
+    models::open(path, &OpenOptions { conventions, ..OpenOptions::default() })?
+        .into_linked()?
+        .with_times(TIMES.to_vec())
 }
 
 fn open(path: &Path) -> Box<dyn InputModel> {
@@ -293,12 +295,12 @@ fn static_capture_is_read_as_static_model() {
     let mut parts: Vec<PythonValue> = order.iter().map(|&i| moving[i].clone()).collect();
     parts[3] = PythonValue::Parameter(tensor(2, &[COUNT, 15, 3], &noise(45 * COUNT, 3.0)));
     let root = folder.put(parts);
-    let model = models::open(&root, &OpenOptions::default()).unwrap();
+    let model = models::open(&root, &OpenOptions::default()).unwrap().into_linked().unwrap();
     assert_eq!(model.kind(), "3D Gaussian Splatting checkpoint");
     let state = gather_all(model.source(), 0, Attributes::all()).unwrap();
     assert_eq!(f64::from(state.sh.plane(5)[2]), floats(&tensor(0, &[COUNT, 45], &noise(45 * COUNT, 3.0)), 2)[2]);
     let result = folder.written(&*model, &CompressedModel::pruned(vec![2], &rule()));
-    let left = models::open(&result, &OpenOptions::default()).unwrap();
+    let left = models::open(&result, &OpenOptions::default()).unwrap().into_linked().unwrap();
     assert_eq!(gather_all(left.source(), 0, Attributes::all()).unwrap(), state.pick(&[2]));
 }
 
@@ -345,16 +347,20 @@ fn best_or_requested_checkpoint_is_read() {
     let folder = CheckpointFolder::new();
     let root = folder.put(capture(true));
     fs::copy(root.join("chkpnt30000.pth"), root.join("chkpnt_best.pth")).unwrap();
-    let notes = models::open(&root, &OpenOptions::default()).unwrap().notes();
+    let notes = models::open(&root, &OpenOptions::default()).unwrap().into_linked().unwrap().notes();
     assert!(notes.iter().any(|note| note.contains("chkpnt_best.pth is read")), "{notes:?}");
     assert!(notes.iter().any(|note| note.contains("--time-duration")), "{notes:?}");
-    let open_iteration =
-        |iteration| models::open(&root, &OpenOptions { iteration: Some(iteration), ..OpenOptions::default() });
+    let open_iteration = |iteration| {
+        models::open(&root, &OpenOptions { iteration: Some(iteration), ..OpenOptions::default() })
+            .and_then(models::Opened::into_linked)
+    };
     assert!(open_iteration(30_000).unwrap().notes().iter().all(|note| !note.contains("best")));
     let error = open_iteration(7).err().unwrap().to_string();
     assert!(error.contains("chkpnt7.pth") && error.contains("chkpnt30000.pth"), "{error}");
     // The guessed period of colors depends on the frame times.
-    let at = |times: Vec<f64>| models::open(&root, &OpenOptions::default()).unwrap().with_times(times).unwrap().notes();
+    let at = |times: Vec<f64>| {
+        models::open(&root, &OpenOptions::default()).unwrap().into_linked().unwrap().with_times(times).unwrap().notes()
+    };
     assert!(at(vec![0.0, 1.0]).iter().any(|note| note.contains("every 1 ")), "{:?}", at(vec![0.0]));
     assert!(at(vec![0.0, 1.5]).iter().any(|note| note.contains("every 10 ")));
 }

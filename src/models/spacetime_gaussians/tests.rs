@@ -81,7 +81,7 @@ fn folder(is_full: bool) -> tempfile::TempDir {
 }
 
 fn open(path: &Path) -> Result<Box<dyn InputModel>> {
-    models::open(path, &OpenOptions::default())
+    models::open(path, &OpenOptions::default()).and_then(models::Opened::into_linked)
 }
 
 const TIMES: [f64; 4] = [0.0, 0.25, 0.5, 0.9];

@@ -44,7 +44,7 @@ fn params() -> StoredParams {
 }
 
 fn open_at(path: &Path, times: &[f64]) -> Box<dyn InputModel> {
-    models::open(path, &OpenOptions::default()).unwrap().with_times(times.to_vec()).unwrap()
+    models::open(path, &OpenOptions::default()).unwrap().into_linked().unwrap().with_times(times.to_vec()).unwrap()
 }
 
 fn states(model: &dyn InputModel) -> Vec<Gaussians> {
@@ -192,7 +192,7 @@ fn a_tsog_of_single_frames_shows_each_gaussian_once() {
     let [path, small] = ["a.tsog", "small.tsog"].map(|name| folder.path().join(name));
     write_tsog(&timed(Timeline::Frames(5)), &path).unwrap();
     let stored = read_tsog(&path, ReadLimit::NONE).unwrap().params;
-    let model = models::open(&path, &OpenOptions::default()).unwrap();
+    let model = models::open(&path, &OpenOptions::default()).unwrap().into_linked().unwrap();
     assert_eq!((model.timing(), model.source().info().times.len()), (TimeOrigin::Numbered, 5));
     for (frame, state) in states(&*model).iter().enumerate() {
         for i in 0..COUNT {
@@ -211,7 +211,7 @@ fn a_still_tsog_is_one_frame() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("still.zip");
     write_tsog(&timed(Timeline::Still), &path).unwrap();
-    let model = models::open(&path, &OpenOptions::default()).unwrap();
+    let model = models::open(&path, &OpenOptions::default()).unwrap().into_linked().unwrap();
     assert_eq!((model.source().info().times.len(), model.source().info().varying), (1, Attributes::empty()));
     assert_eq!(states(&*model)[0].len(), COUNT);
 }
@@ -230,7 +230,7 @@ fn archives_hold_windows_as_ftgs_and_single_frames_as_frames() {
     }
     for timeline in [Timeline::Frames(4), Timeline::Still] {
         write_tsog(&timed(timeline), &tsog).unwrap();
-        let model = models::open(&tsog, &OpenOptions::default()).unwrap();
+        let model = models::open(&tsog, &OpenOptions::default()).unwrap().into_linked().unwrap();
         assert!(model.archives_as_frames() && model.check_output(OutputKind::Archive, Path::new("a.gsz")).is_ok());
     }
 }

@@ -20,6 +20,7 @@ pub(crate) mod refine;
 pub(crate) mod rounds;
 pub(crate) mod scan;
 pub(crate) mod size;
+pub(crate) mod track;
 pub mod write;
 
 use super::planning::Planning;
