@@ -85,6 +85,7 @@ pub fn convert(
     plan.send_stage_times(input.memory.tell, &input.events);
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
+    notes.extend(kind.motion_note(frames).map(str::to_owned));
     let mut write = |path: &Path| -> Result<u64> {
         notes.extend(model.write(&all, kind, path, &plan.limits, &input.events)?);
         Ok(model.size_written(kind, path)?.total())
@@ -106,6 +107,7 @@ pub fn convert(
         staged.commit()?;
         bytes
     };
+    let frames = if kind.motion_note(frames).is_some() { 1 } else { frames };
     Ok(ConvertReport { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
 }
 

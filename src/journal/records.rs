@@ -199,7 +199,7 @@ pub struct QualitySummary {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ssim: Option<f64>,
     /// Whether the quality is that of the result before it was converted to the format of the output, because the
-    /// output was not read back. The output stores rounded values or fitted motion, so it may be worse.
+    /// output was not read back. The output stores rounded values, fitted motion or no motion, so it may be worse.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub before_conversion: bool,
     /// Render times of the original and the result, if measured.

@@ -171,6 +171,13 @@ impl OutputKind {
         }
     }
 
+    /// Returns a note for the user if this kind of output leaves out the motion of a model with `frames` frames: a
+    /// `.ply` holds the stored Gaussians of a model, before any motion.
+    pub fn motion_note(self, frames: usize) -> Option<&'static str> {
+        let leaves_out = self == OutputKind::Ply && frames > 1;
+        leaves_out.then_some("a .ply holds the Gaussians of the model without its motion")
+    }
+
     /// Returns the number of bytes of memory per Gaussian that encoding one frame takes, besides the frame itself.
     /// `state_bytes` is the number of bytes of the attributes of one Gaussian.
     pub fn encoding_bytes(self, state_bytes: u64) -> u64 {

@@ -205,15 +205,23 @@ impl Summary {
         if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 || self.is_unreadable {
             return Ok(());
         }
-        let stem = output.with_extension("");
-        let input = Path::new(&self.input.path);
+        let beside = |ending: &str| {
+            let mut path = output.with_extension("").into_os_string();
+            path.push(ending);
+            shell_word(Path::new(&path))
+        };
         let given = self.given_cameras.as_deref();
-        let cameras = given.map_or(String::new(), |cameras| format!(" --cameras {}", cameras.shown()));
-        let [original, result, page] = [input, output, &stem].map(ShowPath::shown);
-        writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}.html")?;
+        let cameras = given.map_or(String::new(), |cameras| format!(" --cameras {}", shell_word(cameras)));
+        let [original, result] = [Path::new(&self.input.path), output].map(shell_word);
+        let page = beside(".html");
         let kind = OutputKind::from_path(output, None, OutputKind::Model);
+        match kind.motion_note(self.input.frames.unwrap_or(1)) {
+            // A still cannot be shown beside a model with other frames.
+            Some(_) => writeln!(out, "\nSee it:   splatsieve view {result} -o {page}")?,
+            None => writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}")?,
+        }
         if kind == OutputKind::Model && self.output_size.field > 0 {
-            writeln!(out, "Smaller:  -o {}.gsz writes an archive, which unpacks to the same folder", stem.shown())?;
+            writeln!(out, "Smaller:  -o {} writes an archive, which unpacks to the same folder", beside(".gsz"))?;
         }
         Ok(())
     }
@@ -224,6 +232,15 @@ impl Summary {
         let seconds = self.stages.iter().filter(|stage| !stage.from_cache).map(|stage| stage.seconds).sum();
         (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
     }
+}
+
+/// Returns `path` as a word of a shell command: in single quotes if it has characters with a meaning for the shell, and
+/// after `./` if it would be taken for an option.
+fn shell_word(path: &Path) -> String {
+    let text = path.shown().to_string();
+    let text = if text.starts_with('-') { format!("./{text}") } else { text };
+    let is_plain = |c: char| c.is_alphanumeric() || "_-./+=:@%,".contains(c);
+    if !text.is_empty() && text.chars().all(is_plain) { text } else { format!("'{}'", text.replace('\'', r"'\''")) }
 }
 
 /// Writes a row of the table to `out`: the name of a quantity, its value for the original, its value for the result,
@@ -272,6 +289,19 @@ mod tests {
     fn numbers_are_grouped_by_three_digits() {
         for (number, text) in [(0, "0"), (999, "999"), (20883, "20,883"), (1_234_567, "1,234,567")] {
             assert_eq!(grouped(number), text);
+        }
+    }
+
+    #[test]
+    fn paths_are_words_of_the_shell() {
+        for (path, word) in [
+            ("out/small.ply", "out/small.ply"),
+            ("my scene", "'my scene'"),
+            ("it's", r"'it'\''s'"),
+            ("-x.ply", "./-x.ply"),
+            ("$HOME", "'$HOME'"),
+        ] {
+            assert_eq!(shell_word(Path::new(path)), word);
         }
     }
 

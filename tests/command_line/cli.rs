@@ -105,6 +105,13 @@ fn final_report_has_count_size_quality_time_and_path() {
         unread.contains(" test views, before conversion to the format of the output)") && !unread.contains("See it:"),
         "{unread}"
     );
+    // A still is not shown beside the moving model.
+    let still = workplace.done(&format!("{options} -o still.ply"));
+    assert!(
+        still.contains("before conversion") && still.contains("note: a .ply holds the Gaussians of the model without"),
+        "{still}"
+    );
+    assert!(still.contains("\nSee it:   splatsieve view still.ply -o still.html\n"), "{still}");
     let all = workplace.done(&format!("{options} -o again --verbose"));
     assert!(
         all.contains("left out: ") && all.contains(" -> ") && all.contains("\nGaussians              300         150"),

@@ -314,7 +314,8 @@ impl WriteStage {
                     None => {
                         let about_file =
                             scene.input.write(compressed, self.kind, path, &scene.limits, &scene.events)?;
-                        let mut about_file = about_file.into_iter();
+                        let about_motion = self.kind.motion_note(scene.source().info().times.len()).map(str::to_owned);
+                        let mut about_file = about_motion.into_iter().chain(about_file);
                         // A brief summary shows only the first notes.
                         journal.notes.splice(0..0, about_file.next());
                         journal.notes.extend(about_file);
