@@ -38,7 +38,7 @@ use crate::journal::records::RenderTime;
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
-use crate::model::{Camera, FrameView, Gaussians};
+use crate::model::{Camera, FrameView, Gaussians, Split};
 use crate::models::InputModel;
 use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::stages::quality::render_times;
@@ -169,6 +169,8 @@ pub struct ModelPair {
     background: [f32; 3],
     flip: bool,
     views: Vec<FrameView>,
+    /// Split to which the views belong; `None` for views of all splits.
+    split: Option<Split>,
     truth_folder: Option<PathBuf>,
     truth: Option<Photographs>,
 }
@@ -203,6 +205,7 @@ impl ModelPair {
                 ..options.original.clone()
             },
             views: chosen,
+            split: options.views.split(&scene.rig),
             scene,
             compressed,
             background,
@@ -353,6 +356,13 @@ impl ModelPair {
                 cameras: self.views.iter().map(|view| view.camera).collect::<HashSet<_>>().len(),
                 pairs: self.views.len(),
             },
+            split: match self.split {
+                None => "all",
+                Some(Split::Train) => "train",
+                Some(Split::Val) => "val",
+                Some(Split::Test) => "test",
+            }
+            .to_owned(),
             background: self.background,
             loss: Comparison::from_views(&view_qualities, |view| Some(view.loss)).expect("every view has this score"),
             rig_sides: InsideOutsideMeans::from_views(&view_qualities, &self.outside_views()),

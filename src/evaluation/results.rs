@@ -152,6 +152,8 @@ pub struct Evaluation {
     pub size: OriginalAndCompressed<ModelSize>,
     /// Origin and number of the cameras, and number of the views on which the models are compared.
     pub cameras: CameraSummary,
+    /// Split to which these views belong: `train`, `val` or `test`; `all` for views of all splits.
+    pub split: String,
     /// Background color: red, green, blue in [0, 1].
     pub background: [f32; 3],
     /// Mean quality measures of the compressed model against the original.
@@ -266,6 +268,14 @@ impl Evaluation {
         self.views.iter().min_by(|a, b| a.loss.psnr.total_cmp(&b.loss.psnr))
     }
 
+    /// Returns the largest number of frames between an evaluated image of a view and the previous evaluated image of the
+    /// same view; 0 if no view has two images.
+    fn max_frame_step(&self) -> usize {
+        let mut last = BTreeMap::new();
+        let steps = self.views.iter().filter_map(|view| Some(view.frame - last.insert(view.view, view.frame)?));
+        steps.max().unwrap_or(0)
+    }
+
     /// Returns the evaluation as text for the terminal: both models, a table of mean quality measures, the worst view
     /// and the worst frame, and the notes.
     pub fn text(&self) -> String {
@@ -289,7 +299,13 @@ impl Evaluation {
             after.format_relative_to(&before)
         );
         let frames = self.loss.per_frame.len();
-        let _ = writeln!(out, "{} views of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
+        let kind = match self.split.as_str() {
+            "train" => "training views",
+            "val" => "validation views",
+            "test" => "test views",
+            _ => "views",
+        };
+        let _ = writeln!(out, "{} {kind} of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
         let with_flip = self.loss.overall.flip.is_some();
         let flip = if with_flip { "     FLIP" } else { "" };
         let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}{flip}", "", "PSNR dB", "SSIM", "temporal");
@@ -324,6 +340,13 @@ impl Evaluation {
                     truth.compared_views, truth.folder
                 );
             }
+        }
+        let step = self.max_frame_step();
+        if step > 1 && self.loss.overall.temporal.is_some() {
+            let _ = writeln!(
+                out,
+                "  temporal error: between evaluated images of a view, which are up to {step} frames apart"
+            );
         }
         if let Some(RenderTime { before, after }) = self.render_ms {
             let _ =
@@ -395,6 +418,7 @@ mod tests {
             bytes: OriginalAndCompressed { original: 0, compressed: 0 },
             size: OriginalAndCompressed { original: ModelSize::default(), compressed: ModelSize::default() },
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
+            split: "test".to_owned(),
             background: [0.0; 3],
             loss: Comparison::from_views(&views, |view| Some(view.loss)).unwrap(),
             rig_sides: None,
@@ -423,6 +447,18 @@ mod tests {
         let text = found.text();
         assert!(text.contains("2 views inside the training rig"), "{text}");
         assert!(text.contains("1 views outside the training rig"), "{text}");
+    }
+
+    #[test]
+    fn text_names_the_split_and_the_distance_of_compared_frames() {
+        let images = |last| {
+            vec![view_quality(0, 1, 30.0, None), view_quality(0, 2, 30.0, None), view_quality(last, 1, 30.0, Some(0.1))]
+        };
+        let (next, apart) = (evaluation(images(1)).text(), evaluation(images(4)).text());
+        assert!(next.contains("\n2 test views of 2 frames: ") && !next.contains("apart"), "{next}");
+        assert!(apart.contains("images of a view, which are up to 4 frames apart\n"), "{apart}");
+        let all = Evaluation { split: "all".to_owned(), ..evaluation(images(1)) }.text();
+        assert!(all.contains("\n2 views of 2 frames: "), "{all}");
     }
 
     #[test]

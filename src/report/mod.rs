@@ -51,8 +51,9 @@ use crate::model::{Camera, Gaussians, Split, StatisticRows, ViewSchedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::stages::measure::MeasureStages;
+use crate::pipeline::stages::rounds;
 use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored, UserOverrides};
-use crate::recipe::{NonFinitePolicy, Recipe};
+use crate::recipe::{NonFinitePolicy, Recipe, ScanFrames};
 use crate::scene::Scene;
 pub use findings::{CompressedModelData, ReportData};
 
@@ -273,18 +274,23 @@ fn scored_views(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
 }
 
 /// Returns a note if the 1st or 99th percentile of a term of the score differs from that of the run that wrote the
-/// compressed model. The scores in the report then differ from the scores by which Gaussians were removed.
+/// compressed model. The scores in the report then differ from the scores by which Gaussians were removed. Returns no
+/// note if pruning rounds removed the Gaussians: the run then measured its scores on few frames and pixels.
 fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
     let (summary, _) = run.summary.as_ref()?;
+    let measures_little = run.recipe.as_ref().is_some_and(|recipe| recipe.scan.scan_frames == ScanFrames::Needed);
+    if measures_little && summary.stages.iter().any(|stage| stage.name == rounds::NAME) {
+        return None;
+    }
     let found = scored.term_summaries();
     let differs = |then: &&TermSummary| {
         !found.iter().any(|now| now.name == then.name && same(now.p1, then.p1) && same(now.p99, then.p99))
     };
     let then = summary.terms.iter().find(differs)?;
     Some(format!(
-        "the scores shown are computed anew and differ from those of the run, whose 99th percentile of {} was {}: \
+        "the scores shown are computed anew and differ from those of the run, whose 99th percentile of {} was {:.4}: \
          cameras, split or frames are not the same",
         then.name, then.p99
     ))

@@ -188,6 +188,8 @@ fn several_results_stand_side_by_side() {
     balanced(&page);
     let other = &found["others"][0];
     assert_eq!(other["evaluation"]["count"]["compressed"], json!(120));
+    // Pruning rounds removed the Gaussians of this result, so its scores are not compared with those of the report.
+    assert_eq!(other["notes"], json!([]));
     let alone = at.done("evaluate d/scene.gseq tiny.gseq --cameras d/cameras.json --json");
     let alone: Value = serde_json::from_str(&alone).unwrap();
     assert_eq!(other["evaluation"]["psnr"], alone["psnr"]);

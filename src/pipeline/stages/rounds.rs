@@ -30,7 +30,7 @@ use crate::recipe;
 use crate::scene::Scene;
 
 /// Name of this stage in plans, progress and summaries.
-const NAME: &str = "rounds";
+pub(crate) const NAME: &str = "rounds";
 
 /// Stage that ranks Gaussians in pruning rounds. A round ranks the survivors (Gaussians not removed so far) by removal
 /// error, the squared error of renders caused by removing one of them, and removes the lowest-ranked.
