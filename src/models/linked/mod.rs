@@ -189,7 +189,12 @@ impl InputModel for LinkedFrames {
         events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
-            OutputKind::PlySequence => self.write_files(compressed, path, events).map(|()| Vec::new()),
+            OutputKind::PlySequence => {
+                self.write_files(compressed, path, events)?;
+                let note = "the written frames do not identify their Gaussians either: commands that read them link \
+                            them again and may find another number of tracks";
+                Ok(vec![note.to_owned()])
+            }
             _ => write_trajectories(self, compressed, kind, path, limits, events),
         }
     }
