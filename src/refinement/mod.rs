@@ -25,6 +25,7 @@ pub(crate) mod prune_steps;
 mod quantized;
 mod rounding;
 mod run;
+mod step_input;
 mod survivors;
 pub(crate) mod targets;
 
@@ -248,7 +249,7 @@ impl RefineStage {
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
         // With a deformation field, no reader is open while steps are made. While states are evaluated again, two more
         // states and what the field computes without time are held; while views are rendered, one state per thread and
-        // the renderer's buffers.
+        // the renderer's buffers. A step on several threads holds the state of its frame and that of the next step.
         let is_deformed = work.input.jacobian > 0;
         let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
         let left_readers = if is_deformed { [("readers", 0), ("kept frames", 0)] } else { read };
@@ -309,7 +310,7 @@ impl RefineStage {
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
         let stored = work.on_grid(self.stored_stride(work.pixels, first as usize));
         // Whole views are rendered for validation, `together` at a time, with 6 bytes per pixel of the target view.
-        // Steps render pixels of a grid, and hold the image, its gradient and the target view.
+        // Steps render pixels of a grid, and hold the image, its gradient and the target views of two steps.
         let whole_views = together * 24 * work.pixels;
         let views_of_steps = (work.threads + 4) * 12 * stored.pixels;
         ResourceEstimate {

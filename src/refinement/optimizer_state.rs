@@ -10,6 +10,7 @@ use serde::Serialize;
 use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
 use super::loss::{Loss, RenderQuality, limit_slope};
 use super::rounding::Rounding;
+use super::step_input::{StepFiles, StepInput};
 use super::targets::Targets;
 use crate::archive::CloudSteps;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
@@ -88,6 +89,8 @@ pub(super) struct OptimizerState<'a> {
     gradients: Gradients,
     /// Buffer for the state of the frame that is being rendered.
     now: LinearizedState,
+    /// Data of the next optimization step if it was read during the last one.
+    prefetched: Option<StepInput>,
     renderer: Renderer,
     /// Stride n of the training views: only every n-th column and row of pixels is rendered in optimization steps and
     /// for the ranking of a prune step.
@@ -148,6 +151,7 @@ impl<'a> OptimizerState<'a> {
             changing: vec![Attributes::empty(); fixed.len()],
             gradients: Gradients::new(0, columns, sh_degree),
             now: LinearizedState::none(state_degree),
+            prefetched: None,
             renderer: Renderer::on_all_threads(),
             stride: targets.stride(),
             mean_square_slope: None,
@@ -189,7 +193,7 @@ impl<'a> OptimizerState<'a> {
     /// left. Its delta (change of the parameters) is 0. Also sets `stride`, the stride of the rendered pixels of
     /// training views, for this number of Gaussians (see [`Loss::stride`]).
     fn start_optimizer(&mut self) {
-        self.reevaluated = false;
+        (self.reevaluated, self.prefetched) = (false, None);
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
         let StepParams { columns, sh_degree, loss } = self.step_params;
         self.constant_optimizer = Adam::new(state, columns, sh_degree, &self.fixed);
@@ -278,11 +282,12 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Frees the buffers of the renderer that the optimization steps use. The memory plan counts only one of three
-    /// amounts, which are therefore never in memory together: these buffers, the time-independent results of a
-    /// deformation field, and the renderers of [`OptimizerState::removal_error`].
+    /// Frees the buffers of the renderer that the optimization steps use, and the data that were read for the next
+    /// step. The memory plan counts only one of three amounts, which are therefore never in memory together: these
+    /// buffers, the time-independent results of a deformation field, and the renderers of
+    /// [`OptimizerState::removal_error`].
     fn free_buffers(&mut self) {
-        self.renderer = Renderer::on_all_threads();
+        (self.renderer, self.prefetched) = (Renderer::on_all_threads(), None);
     }
 
     /// Returns the contents of a checkpoint, from which [`OptimizerState::resume`] continues.
@@ -395,6 +400,13 @@ impl<'a> OptimizerState<'a> {
     /// refinement has made so far. `change`: delta of `constant_optimizer`.
     fn compute_state(&self, k: usize, change: &ParamDelta, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
+        self.add_deltas(k, change, now);
+        Ok(())
+    }
+
+    /// Adds all changes that refinement has made so far to `now`, the stored state of the frame with index `k` in
+    /// `self.frames`. `change`: delta of `constant_optimizer`.
+    fn add_deltas(&self, k: usize, change: &ParamDelta, now: &mut LinearizedState) {
         match &now.present {
             None => now.jacobian.add_to(&change.0, &mut now.state),
             Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),
@@ -408,36 +420,44 @@ impl<'a> OptimizerState<'a> {
             });
             deltas.iter().for_each(|change| change.add_to(&mut now.state, Attributes::all()));
         }
-        Ok(())
     }
 
     /// Returns the index in `self.frames` of the frame of target view `k`.
     fn frame_index(&self, k: usize) -> usize {
-        self.frames.binary_search(&self.targets.views[k].frame).unwrap_or_default()
+        self.step_files().frame_index(k)
+    }
+
+    /// Returns the scratch files of the optimization steps.
+    fn step_files(&self) -> StepFiles<'_> {
+        let OptimizerState { targets, stride, ref frames, ref linearized, .. } = *self;
+        StepFiles { targets, stride, frames, linearized }
     }
 
     /// Makes one optimization step of the constant delta (change of the stored parameters), on target view `k` with the
-    /// learning rates of `schedule`.
+    /// learning rates of `schedule`. `next`: target view of the next step, whose data are then read during this step if
+    /// there are several threads; `None` if something else uses this optimizer before the next step.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read or written.
-    pub(super) fn step(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
+    pub(super) fn step(&mut self, k: usize, next: Option<usize>, schedule: &RateSchedule) -> Result<()> {
         if self.steps == REEVALUATE_EVERY {
             self.reevaluate_states()?;
         }
         self.steps += 1;
-        self.differentiate(k)?;
+        // An evaluation of the states at the start of the next step would replace the data read for it.
+        let is_reevaluated = self.deformation.is_some() && self.steps == REEVALUATE_EVERY;
+        self.differentiate(k, next.filter(|_| !is_reevaluated))?;
         self.constant_optimizer.step(&self.gradients, 1.0, schedule);
         Ok(())
     }
 
     /// Makes one optimization step of the time-varying delta (values added to each frame), on target view `k` with the
-    /// learning rates of `schedule`.
+    /// learning rates of `schedule`. `next`: as in [`OptimizerState::step`].
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
-    pub(super) fn step_trajectory(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
-        self.differentiate(k)?;
+    pub(super) fn step_trajectory(&mut self, k: usize, next: Option<usize>, schedule: &RateSchedule) -> Result<()> {
+        self.differentiate(k, next)?;
         // Attributes that do not vary with time in the input get no time-varying delta.
         for column in self.step_params.columns.iter() {
             let slopes = self.gradients.derivatives_mut(column);
@@ -454,28 +474,39 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Renders target view `k` and computes the derivatives of its loss with respect to the stored parameters into
-    /// `self.gradients`.
-    fn differentiate(&mut self, k: usize) -> Result<()> {
-        let (target, view) = (self.targets.values(k, self.stride)?, self.targets.view(k, self.stride));
-        let mut now = std::mem::take(&mut self.now);
-        self.compute_state(self.frame_index(k), &self.rendered_delta(), &mut now)?;
+    /// `self.gradients`. If there are several threads, reads the data of the step on view `next` meanwhile: parts of
+    /// the render run on one thread only.
+    fn differentiate(&mut self, k: usize, next: Option<usize>) -> Result<()> {
+        let now = std::mem::take(&mut self.now);
+        let (StepInput { target, frame: mut now, .. }, spare) = match self.prefetched.take() {
+            Some(input) if input.view == k => (input, now),
+            _ => (StepInput::read(self.step_files(), k, now)?, LinearizedState::default()),
+        };
+        self.add_deltas(self.frame_index(k), &self.rendered_delta(), &mut now);
         self.gradients.clear();
         let StepParams { columns, sh_degree, loss } = self.step_params;
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
+        let OptimizerState { scene, targets, stride, ref frames, ref linearized, .. } = *self;
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
-        let (is_guard, mean_square) = (self.targets.is_guard(k), &mut self.mean_square_slope);
+        let (is_guard, mean_square) = (targets.is_guard(k), &mut self.mean_square_slope);
         // Also updates the running mean.
         let pull = |render: &_| {
             let mut slope = loss.slope(render, &target);
             limit_slope(&mut slope, is_guard, mean_square);
             (0.0, slope)
         };
-        self.renderer.gradient(&now.state, view, self.scene.background, pull, gradients);
+        let (renderer, view) = (&mut self.renderer, targets.view(k, stride));
+        let next = next.filter(|_| rayon::current_num_threads() > 1);
+        let files = StepFiles { targets, stride, frames, linearized };
+        let ((), read) = rayon::join(
+            || _ = renderer.gradient(&now.state, view, scene.background, pull, gradients),
+            || next.map(|next| StepInput::read(files, next, spare)).transpose(),
+        );
         now.jacobian.pull_back(gradients);
         if let Some((present, gradients)) = now.present.as_ref().zip(sparse) {
             self.gradients.set_rows(present, &gradients);
         }
-        self.now = now;
+        (self.now, self.prefetched) = (now, read?);
         Ok(())
     }
 

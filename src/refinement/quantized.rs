@@ -51,7 +51,8 @@ impl RefineStage {
         let schedule = RateSchedule::new(self.steps, RATES[1] / RATES[0], error).scaled_by(RATES[0]);
         let (mut sampler, mut mean) = (EpochSampler::new(views.training.clone()), MeanDelta::default());
         for step in 1..=self.steps {
-            optimizer.step(sampler.next(), &schedule)?;
+            let (view, next) = (sampler.next(), (step < self.steps).then(|| sampler.peek()));
+            rayon::scope(|_| optimizer.step(view, next, &schedule))?;
             if is_averaged(step, self.steps) || step == self.steps {
                 mean.add(optimizer.change());
             }

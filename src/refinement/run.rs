@@ -117,13 +117,19 @@ impl EpochSampler {
     }
 
     pub(super) fn next(&mut self) -> usize {
+        let view = self.peek();
+        self.at += 1;
+        self.taken += 1;
+        view
+    }
+
+    /// Returns the view that [`EpochSampler::next`] will return.
+    pub(super) fn peek(&mut self) -> usize {
         if self.at == self.views.len() {
             self.random.shuffle(&mut self.views);
             self.at = 0;
         }
-        self.at += 1;
-        self.taken += 1;
-        self.views[self.at - 1]
+        self.views[self.at]
     }
 
     /// Skips views of the random order until `steps` views have been taken since the beginning. Used to continue an
@@ -336,10 +342,13 @@ impl<'a> RefineRun<'a> {
         if self.keyframe_count() > 0 { along_time(steps) } else { 0 }
     }
 
-    fn step(&mut self, optimizer: &mut OptimizerState<'_>, schedule: &RateSchedule) -> Result<()> {
+    /// Makes an optimization step by the function `step`, whose arguments are the target view and, if `has_next`, the
+    /// target view of the next step. `has_next`: whether the next step follows without a validation before it.
+    fn step(&mut self, has_next: bool, step: impl FnOnce(usize, Option<usize>) -> Result<()> + Send) -> Result<()> {
         let view = self.sampler.next();
+        let next = has_next.then(|| self.sampler.peek());
         // Enters the thread pool once. From outside, every parallel loop of the step would have to wake a thread.
-        rayon::scope(|_| optimizer.step(view, schedule))?;
+        rayon::scope(|_| step(view, next))?;
         self.progress.advance(1);
         Ok(())
     }
@@ -414,7 +423,7 @@ impl<'a> RefineRun<'a> {
                     }
                 };
                 for step in done..steps {
-                    self.step(optimizer, &schedule)?;
+                    self.step(step + 1 < steps, |view, next| optimizer.step(view, next, &schedule))?;
                     self.save_checkpoint(optimizer, timer, (step + 1, schedule), None)?;
                 }
                 let views: Vec<usize> = (0..RANKING_VIEWS).map(|_| self.sampler.next()).collect();
@@ -464,11 +473,12 @@ impl<'a> RefineRun<'a> {
         };
         let validate_every = steps.div_ceil(3).clamp(VALIDATE_EVERY[0], VALIDATE_EVERY[1]);
         for step in done + 1..=steps {
-            self.step(optimizer, &schedule)?;
+            let is_validated = self.refine.validates && step % validate_every == 0 || step == steps;
+            self.step(!is_validated, |view, next| optimizer.step(view, next, &schedule))?;
             if is_averaged(step, steps) {
                 best_state.mean.add(optimizer.change());
             }
-            if self.refine.validates && step % validate_every == 0 || step == steps {
+            if is_validated {
                 match step == steps && best_state.mean.count > 0 {
                     true => optimizer.restart_from(&best_state.mean.delta)?,
                     false => optimizer.reevaluate_states()?,
@@ -543,9 +553,9 @@ impl<'a> RefineRun<'a> {
         }
         let validate_every = keyframe_steps.div_ceil(3);
         for step in done.saturating_sub(steps) + 1..=keyframe_steps {
-            optimizer.step_trajectory(self.sampler.next(), &schedule)?;
-            self.progress.advance(1);
-            if self.refine.validates && step % validate_every == 0 || step == keyframe_steps {
+            let is_validated = self.refine.validates && step % validate_every == 0 || step == keyframe_steps;
+            self.step(!is_validated, |view, next| optimizer.step_trajectory(view, next, &schedule))?;
+            if is_validated {
                 let now = optimizer.quality(&self.validation)?;
                 let gains = self.refine.loss.ssim > 0.0 || now.psnr >= best_state.best.psnr + MIN_KEYFRAME_GAIN;
                 if (gains || !self.refine.validates) && self.keeps(&now, &best_state.best) {

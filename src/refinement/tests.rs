@@ -311,6 +311,36 @@ fn models_without_possible_gain_stay_unchanged() {
 }
 
 #[test]
+fn reading_ahead_does_not_change_steps() {
+    let folder = tempfile::tempdir().unwrap();
+    let explicit = scene(folder.path());
+    let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+    let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+    for scene in [explicit, open_scene(&options).unwrap()] {
+        let targets = Targets::new(&scene, TargetViewParams::at_most(60), NonZeroU32::MIN, false).unwrap();
+        let kept = (0..scene.source().info().count as u32).step_by(2).collect();
+        let compressed = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
+        let result = scene.input.compressed_frames(&compressed).unwrap();
+        let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, false).unwrap();
+        let change = |next: fn(usize) -> Option<usize>| {
+            let fixed = vec![false; compressed.len()];
+            let mut optimizer = OptimizerState::new(&scene, &*result, &targets, refine.step_params(), fixed).unwrap();
+            let schedule = RateSchedule::new(230, 1.0, 1.0);
+            // More steps than between two evaluations of the states.
+            (0..220).for_each(|k| optimizer.step(k % 50, next(k), &schedule).unwrap());
+            optimizer.pick(&(0..compressed.len() as u32).step_by(3).collect::<Vec<_>>()).unwrap();
+            (220..230).for_each(|k| optimizer.step(k % 50, next(k), &schedule).unwrap());
+            optimizer.change()
+        };
+        let expected = pool.install(|| change(|_| None));
+        assert!(!expected.is_empty());
+        assert!(pool.install(|| change(|k| Some((k + 1) % 50))) == expected, "data read ahead change it");
+        assert!(pool.install(|| change(|k| Some(7 * k % 50))) == expected, "data of another view change it");
+    }
+}
+
+#[test]
 fn the_optimizer_restarts_and_continues_with_a_subset() {
     let folder = tempfile::tempdir().unwrap();
     let explicit = scene(folder.path());
@@ -328,7 +358,8 @@ fn the_optimizer_restarts_and_continues_with_a_subset() {
         let (views, schedule) = ([0, 7, 20], RateSchedule::new(20, 1.0, 1.0));
         let start = optimizer.quality(&views).unwrap().psnr;
         let no_delta = optimizer.change();
-        let run = |optimizer: &mut OptimizerState<'_>| (0..20).for_each(|k| optimizer.step(k, &schedule).unwrap());
+        let run =
+            |optimizer: &mut OptimizerState<'_>| (0..20).for_each(|k| optimizer.step(k, None, &schedule).unwrap());
         run(&mut optimizer);
         optimizer.reevaluate_states().unwrap();
         optimizer.restart_from(&no_delta).unwrap();

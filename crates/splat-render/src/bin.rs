@@ -45,33 +45,40 @@ pub(super) struct Bins {
 
 impl Bins {
     /// Sorts `splats` by depth and counts the splats of each tile, in an image of `tiles` = (across, down) tiles. No
-    /// (splat, tile) pairs are in memory yet.
-    pub(super) fn begin(&mut self, splats: &Splats, tiles: [u32; 2]) {
-        self.keys.clear();
-        self.keys.reserve_exact(splats.splats.len());
-        let depths = splats.splats.iter().map(|splat| u64::from(ordered_bits(splat.sort_depth)));
-        self.keys.extend(depths.enumerate().map(|(i, bits)| bits << 32 | i as u64));
-        sort_by_depth(&mut self.keys, &mut self.spare);
-
+    /// (splat, tile) pairs are in memory yet. `parallel`: whether to sort and to count at the same time.
+    pub(super) fn begin(&mut self, splats: &Splats, tiles: [u32; 2], parallel: bool) {
         self.tiles_across = tiles[0] as usize;
-        self.ends.clear();
-        self.ends.resize(self.tiles_across * tiles[1] as usize, 0);
-        for rect in &splats.rects {
-            for y in rect.y0 as usize..rect.y1 as usize {
-                for count in
-                    &mut self.ends[y * self.tiles_across + rect.x0 as usize..y * self.tiles_across + rect.x1 as usize]
-                {
-                    *count += 1;
-                }
-            }
-        }
-        let mut total = 0;
-        for end in &mut self.ends {
-            total += *end;
-            *end = total;
-        }
         self.strip = 0..0;
         self.next_tile = 0;
+        let Bins { keys, spare, ends, tiles_across, .. } = self;
+        let mut sort = || {
+            keys.clear();
+            keys.reserve_exact(splats.splats.len());
+            let depths = splats.splats.iter().map(|splat| u64::from(ordered_bits(splat.sort_depth)));
+            keys.extend(depths.enumerate().map(|(i, bits)| bits << 32 | i as u64));
+            sort_by_depth(keys, spare);
+        };
+        let count = || {
+            ends.clear();
+            ends.resize(*tiles_across * tiles[1] as usize, 0);
+            for rect in &splats.rects {
+                for y in rect.y0 as usize..rect.y1 as usize {
+                    let row = y * *tiles_across;
+                    ends[row + rect.x0 as usize..row + rect.x1 as usize].iter_mut().for_each(|count| *count += 1);
+                }
+            }
+            let mut total = 0;
+            for end in ends {
+                total += *end;
+                *end = total;
+            }
+        };
+        if parallel {
+            rayon::join(sort, count);
+        } else {
+            sort();
+            count();
+        }
     }
 
     /// Makes [`Bins::next_strip`] start again at the first tile. If all tiles were in one strip (range of tiles
@@ -179,6 +186,19 @@ impl Bins {
         })
     }
 
+    /// Splits the range `tiles` of tile numbers into parts of rows of tiles: about `count` parts, but no part has tiles
+    /// of two rows. Yields for each part the index of its row and the range of columns of its tiles.
+    pub(super) fn row_parts(
+        &self,
+        tiles: Range<usize>,
+        count: usize,
+    ) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
+        let row_count = self.rows(tiles.clone()).count().max(1);
+        let len = self.tiles_across.div_ceil(count.div_ceil(row_count).max(1)).max(1);
+        self.rows(tiles)
+            .flat_map(move |(y, columns)| columns.clone().step_by(len).map(move |x| (y, x..columns.end.min(x + len))))
+    }
+
     /// Returns the indices of the splats of the tiles in row `y` and columns `x` of the grid of tiles, tile after tile.
     /// The tiles must lie in the range that [`Bins::next_strip`] returned last, because only its pairs are in memory.
     pub(super) fn pairs_in_row(&self, y: usize, x: Range<usize>) -> &[u32] {
@@ -229,6 +249,18 @@ fn ordered_bits(x: f32) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn row_parts_cover_every_tile_once() {
+        let bins = Bins { tiles_across: 7, ..Bins::default() };
+        let cases = [(0..35, 1, 5), (0..35, 5, 5), (0..35, 16, 20), (3..26, 16, 13), (9..12, 100, 3), (4..4, 3, 0)];
+        for (tiles, count, expected) in cases {
+            let parts: Vec<_> = bins.row_parts(tiles.clone(), count).collect();
+            let found = parts.iter().flat_map(|(y, columns)| columns.clone().map(move |x| 7 * y + x));
+            assert!(found.eq(tiles), "{parts:?}");
+            assert_eq!(parts.len(), expected, "{parts:?}");
+        }
+    }
 
     #[test]
     fn keys_are_sorted_by_all_depth_bits() {

@@ -17,8 +17,11 @@ use super::project::{CameraTerms, Splat, Splats, TileRect, project};
 use super::removal::{RemovalError, RemovalSink};
 use splat_core::{Camera, Gaussians};
 
-/// Number of Gaussians that one parallel task projects. The work is large compared with the overhead of a task.
-const SPAN: usize = 32 * BLOCK;
+/// Maximum number of Gaussians in a span, which one parallel task projects or differentiates.
+const MAX_SPAN: usize = 32 * BLOCK;
+/// Number of tasks per thread into which a parallel loop is divided if there is enough work. Tasks take different
+/// times; with several per thread, all threads finish at about the same time.
+const TASKS_PER_THREAD: usize = 8;
 
 /// Bytes of memory per visible Gaussian during a render: footprint, tile rectangle, and two copies of the depth sort
 /// key.
@@ -123,6 +126,21 @@ impl Renderer {
         }
     }
 
+    /// Returns the number of tasks into which a loop should be divided: 1 if only one thread works on a view. Results
+    /// do not depend on it.
+    pub(super) fn task_count(&self) -> usize {
+        match rayon::current_num_threads() {
+            threads if self.parallel && threads > 1 => TASKS_PER_THREAD * threads,
+            _ => 1,
+        }
+    }
+
+    /// Returns the number of Gaussians of a span, the consecutive Gaussians that one task processes, if `count`
+    /// Gaussians are divided: a multiple of [`BLOCK`], at most [`MAX_SPAN`].
+    pub(super) fn span_len(&self, count: usize) -> usize {
+        count.div_ceil(self.task_count()).next_multiple_of(BLOCK).clamp(BLOCK, MAX_SPAN)
+    }
+
     /// Renders `gaussians` in `view` over the color `background`, like the function [`render`]. The image has the size
     /// of the grid of pixels of `view`.
     pub fn render<'a>(
@@ -144,17 +162,17 @@ impl Renderer {
         let mut data = vec![0.0; row_len * height as usize];
         // An image without pixels has no rows, and chunks must not be empty.
         let tile_row_len = (row_len * TILE as usize).max(1);
+        let task_count = self.task_count();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
-            let first = bins.rows(strip.clone()).next().map_or(0, |(y, _)| y);
-            let render_row = |((y, tiles), rows): ((usize, Range<usize>), &mut [f32])| {
-                for x in tiles {
+            // Renders consecutive tiles of a row. `rows` holds their part of each row of pixels.
+            let render_part = |(y, tiles, mut rows): (usize, Range<usize>, Vec<&mut [f32]>)| {
+                for (k, x) in tiles.enumerate() {
                     let sampled = SampledPixels::new([x as u32, y as u32], view.size, view.grid);
                     let pairs = bins.pairs_in_row(y, x..x + 1);
                     let planes = blend_colors(blend, splats, pairs, &sampled, background);
-                    for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
-                        let start = x * TILE as usize;
-                        let pixels = row[start * 3..].chunks_exact_mut(3).take(TILE as usize);
+                    for (v, row) in rows.iter_mut().enumerate() {
+                        let pixels = row[k * TILE as usize * 3..].chunks_exact_mut(3).take(TILE as usize);
                         for (u, pixel) in pixels.enumerate() {
                             let (group, lane) = (v + u / LANES * TILE as usize, u % LANES);
                             for c in 0..3 {
@@ -164,11 +182,24 @@ impl Renderer {
                     }
                 }
             };
-            let rows = bins.rows(strip).zip(data[first * tile_row_len..].chunks_mut(tile_row_len));
-            if self.parallel {
-                rows.collect::<Vec<_>>().into_par_iter().for_each(render_row);
+            let first = bins.rows(strip.clone()).next().map_or(0, |(y, _)| y);
+            let mut rows = data[first * tile_row_len..].chunks_mut(tile_row_len);
+            // Row of tiles to which `rest` belongs: for each row of pixels, the pixels that are not in a part yet.
+            let (mut row, mut rest) = (None, Vec::new());
+            let parts = bins.row_parts(strip, task_count).map(|(y, tiles)| {
+                if row.replace(y) != Some(y) {
+                    let start = tiles.start * TILE as usize * 3;
+                    let pixel_rows = rows.next().into_iter().flat_map(|rows| rows.chunks_exact_mut(row_len));
+                    rest = pixel_rows.map(|row| &mut row[start..]).collect();
+                }
+                let len = tiles.len() * TILE as usize * 3;
+                let pixels = rest.iter_mut().filter_map(|row| row.split_off_mut(..len.min(row.len()))).collect();
+                (y, tiles, pixels)
+            });
+            if task_count > 1 {
+                parts.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(render_part);
             } else {
-                rows.for_each(render_row);
+                parts.for_each(render_part);
             }
         }
         Image { width, height, data }
@@ -189,9 +220,10 @@ impl Renderer {
         assert_eq!(seen.len(), gaussians.len(), "expected as many contributions as Gaussians");
         let view = CameraTerms::new(PixelGrid::centered(stride).sampled_view(camera));
         self.prepare(gaussians, &view, false);
+        let task_count = self.task_count();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
-            fill_pairs(bins, strip.clone(), self.parallel, &mut self.weights, |tile, pairs, weights| {
+            fill_pairs(bins, strip.clone(), task_count, &mut self.weights, |tile, pairs, weights| {
                 let sampled = SampledPixels::new(tile, view.size, view.grid);
                 blend.tile(splats, pairs, &sampled, &mut WeightSink { pairs: weights });
             });
@@ -240,14 +272,15 @@ impl Renderer {
     /// Projects the Gaussians to splats, which this renderer keeps for later calls, and sorts the splats by depth.
     /// `colored` states whether to compute the colors of the splats, too.
     pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colored: bool) {
-        let count = gaussians.len();
+        let (count, span) = (gaussians.len(), self.span_len(gaussians.len()));
         self.splats.clear();
-        if self.parallel {
-            let spans: Vec<Splats> = (0..count.div_ceil(SPAN))
+        if self.task_count() > 1 {
+            let spans: Vec<Splats> = (0..count.div_ceil(span))
                 .into_par_iter()
-                .map(|span| {
+                .with_max_len(1)
+                .map(|k| {
                     let mut splats = Splats::default();
-                    project(gaussians, span * SPAN..((span + 1) * SPAN).min(count), view, colored, &mut splats);
+                    project(gaussians, k * span..((k + 1) * span).min(count), view, colored, &mut splats);
                     splats
                 })
                 .collect();
@@ -255,7 +288,7 @@ impl Renderer {
         } else {
             project(gaussians, 0..count, view, colored, &mut self.splats);
         }
-        self.bins.begin(&self.splats, view.tiles);
+        self.bins.begin(&self.splats, view.tiles, self.task_count() > 1);
     }
 }
 
@@ -269,24 +302,23 @@ impl Renderer {
 /// - the indices of the splats of the tile,
 /// - the values of the pairs of the tile, one per splat, in the same order.
 ///
-/// If `parallel` is true, the rows of tiles are processed in parallel.
+/// The tiles are divided into about `task_count` tasks, which run in parallel if there is more than one.
 pub(super) fn fill_pairs<T: Copy + Default + Send>(
     bins: &Bins,
     tiles: Range<usize>,
-    parallel: bool,
+    task_count: usize,
     sums: &mut Vec<T>,
     fill_tile: impl Fn([u32; 2], &[u32], &mut [T]) + Sync,
 ) {
     sums.clear();
     sums.resize(bins.pairs(tiles.clone()).len(), T::default());
     let mut remaining = &mut sums[..];
-    let mut rows = Vec::new();
-    for (y, tiles) in bins.rows(tiles) {
-        let (row, after) = remaining.split_at_mut(bins.pairs_in_row(y, tiles.clone()).len());
-        rows.push((y, tiles, row));
+    let parts = bins.row_parts(tiles, task_count).map(|(y, tiles)| {
+        let (part, after) = std::mem::take(&mut remaining).split_at_mut(bins.pairs_in_row(y, tiles.clone()).len());
         remaining = after;
-    }
-    let fill_row = |(y, tiles, mut sums): (usize, Range<usize>, &mut [T])| {
+        (y, tiles, part)
+    });
+    let fill_part = |(y, tiles, mut sums): (usize, Range<usize>, &mut [T])| {
         for x in tiles {
             let pairs = bins.pairs_in_row(y, x..x + 1);
             let (tile_sums, after) = sums.split_at_mut(pairs.len());
@@ -294,10 +326,10 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
             sums = after;
         }
     };
-    if parallel {
-        rows.into_par_iter().for_each(fill_row);
+    if task_count > 1 {
+        parts.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(fill_part);
     } else {
-        rows.into_iter().for_each(fill_row);
+        parts.for_each(fill_part);
     }
 }
 
@@ -376,6 +408,15 @@ mod tests {
     }
 
     #[test]
+    fn results_do_not_depend_on_the_number_of_threads() {
+        let expected = all_results(Renderer::new());
+        for threads in [1, 2, 7] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            assert!(pool.install(|| all_results(Renderer::on_all_threads())) == expected, "{threads} threads");
+        }
+    }
+
+    #[test]
     fn results_do_not_depend_on_the_strip_size() {
         let whole = all_results(Renderer::new());
         let (scene, camera) = scene();
@@ -391,7 +432,7 @@ mod tests {
                     "{strip_pairs} at a time"
                 );
             }
-            renderer.bins.begin(&renderer.splats, [7, 5]);
+            renderer.bins.begin(&renderer.splats, [7, 5], true);
             let mut at = 0;
             while let Some(strip) = renderer.bins.next_strip(&renderer.splats, strip_pairs) {
                 assert!(

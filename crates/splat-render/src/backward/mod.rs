@@ -22,17 +22,12 @@ use rayon::prelude::*;
 
 use super::bin::STRIP_PAIRS;
 use super::blend::SampledPixels;
-use super::convention::BLOCK;
 use super::grid::SampledView;
 use super::project::CameraTerms;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
 use splat_core::{Attributes, Gaussians, GradientSpan, Gradients};
 use sums::{ImageGradientSums, SplatSums};
 use tile::{GradientSink, PixelGradients};
-
-/// Number of Gaussians whose gradients one parallel task computes: a multiple of [`BLOCK`], the block size of the
-/// projection.
-const SPAN: usize = 32 * BLOCK;
 
 /// Bytes of memory per visible Gaussian for a render and for the gradient of a loss of this render.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
@@ -87,16 +82,16 @@ impl Renderer {
         } else {
             self.backward_pass::<true>(&view, &image, &pixel_gradient);
         }
-        let (splats, sums) = (&self.splats.splats, &self.gradient_sums.totals);
+        let (splats, sums, span) = (&self.splats.splats, &self.gradient_sums.totals, self.span_len(gaussians.len()));
         let add = |mut span: GradientSpan<'_>| {
             let [start, end] =
                 [span.ids().start, span.ids().end].map(|id| splats.partition_point(|splat| (splat.id as usize) < id));
             splat::add_gradients(gaussians, &splats[start..end], &sums[start..end], &view, &mut span);
         };
-        if self.parallel {
-            out.spans(SPAN).into_par_iter().for_each(add);
+        if self.task_count() > 1 {
+            out.spans(span).into_par_iter().with_max_len(1).for_each(add);
         } else {
-            out.spans(SPAN).into_iter().for_each(add);
+            out.spans(span).into_iter().for_each(add);
         }
         value
     }
@@ -105,13 +100,15 @@ impl Renderer {
     /// is the derivative of the loss with respect to each value of `image`. If `SHAPE` is false, computes only the sums
     /// for the gradients of colors.
     ///
-    /// First computes the sums of each splat over each tile; a parallel renderer divides this work by rows of tiles.
+    /// First computes the sums of each splat over each tile; a parallel renderer divides this work by parts of rows of
+    /// tiles.
     /// Then adds the sums of the tiles of each splat in a fixed order; a parallel renderer divides this work by splats.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
+        let task_count = self.task_count();
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();
         totals.resize(self.splats.splats.len(), SplatSums::default());
-        let part = match self.parallel {
+        let part = match task_count > 1 {
             true => totals.len().div_ceil(rayon::current_num_threads()).max(1),
             false => totals.len().max(1),
         };
@@ -119,7 +116,7 @@ impl Renderer {
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             for tiles in bins.parts(strip, self.strip_pairs.min(SUMMED_PAIRS)) {
-                fill_pairs(bins, tiles.clone(), self.parallel, pair_sums, |tile, pairs, sums| {
+                fill_pairs(bins, tiles.clone(), task_count, pair_sums, |tile, pairs, sums| {
                     let sampled = SampledPixels::new(tile, view.size, view.grid);
                     let mut sink = GradientSink::<SHAPE> {
                         gradients: PixelGradients::new(image, pixel_gradient, tile),
@@ -135,7 +132,7 @@ impl Renderer {
                         }
                     }
                 };
-                if self.parallel {
+                if task_count > 1 {
                     totals.par_chunks_mut(part).enumerate().for_each(add);
                 } else {
                     totals.chunks_mut(part).enumerate().for_each(add);
