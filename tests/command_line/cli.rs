@@ -144,6 +144,26 @@ fn misuse_exits_with_2() {
 }
 
 #[test]
+fn a_slash_after_an_output_file_is_refused_before_any_work() {
+    let workplace = Workplace::new();
+    for arguments in [
+        "compress {tiny} --no-refine --ratio 10% -o y.gsz/",
+        "compress {tiny} --no-refine --ratio 10% -o y.ply/ --dry-run",
+        "compress {tiny} --no-refine --ratio 10% -o y.gsz --view=y.html/",
+        "convert {tiny} y.gseq/",
+        "convert {tiny} y.ply/",
+        "convert {tiny} y.gsz/",
+        "view {tiny} -o y.html/",
+        "score {tiny} -o y.csv/",
+        "render {tiny} --cameras {tiny} --frame 0 --view 0 -o y.png/",
+        "render {tiny} --cameras {tiny} --video y.png/",
+        "evaluate {tiny} {tiny} --cameras {tiny} --csv y.csv/",
+    ] {
+        workplace.refused(2, arguments, &["found a path that ends in '/'", "follows the name: y."]);
+    }
+}
+
+#[test]
 fn recipes_with_unknown_or_impossible_values_are_refused() {
     let workplace = Workplace::new();
     for (text, part) in [
