@@ -165,6 +165,15 @@ fn a_slash_after_an_output_file_is_refused_before_any_work() {
 
 #[test]
 fn recipes_with_unknown_or_impossible_values_are_refused() {
+#[test]
+fn a_dash_is_an_output_of_convert_alone() {
+    let workplace = Workplace::new();
+    for arguments in ["compress {tiny} --no-refine --ratio 10% -o -", "view {tiny} -o -", "man -", "sweep {tiny} -o -"]
+    {
+        workplace.refused(2, arguments, &["-: expected the name of a file", "convert NAME.gseq -"]);
+    }
+}
+
     let workplace = Workplace::new();
     for (text, part) in [
         ("[score]\nnu = 1.0\n", "nu"),

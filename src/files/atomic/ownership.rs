@@ -217,6 +217,17 @@ pub(super) fn split_target(target: &Path) -> Result<(PathBuf, &OsStr)> {
     Ok((parent.unwrap_or(Path::new(".")).to_owned(), name))
 }
 
+/// Checks that the output path `target` is not `-`, which other programs take for standard output.
+pub(super) fn check_no_stream(target: &Path) -> Result<()> {
+    match target == Path::new("-") {
+        true => Err(Error::usage(
+            "-: expected the name of a file or folder to write, found '-', which stands for standard output\n  \
+             only `splatsieve convert NAME.gseq -` writes there, a frame stream; ./- is a file or folder named '-'",
+        )),
+        false => Ok(()),
+    }
+}
+
 /// Checks that the output path `target` ends in the name of the output, which is a folder if `is_folder` is set.
 /// `file_name` of the standard library ignores `/` and `/.` after a name, but system calls do not: they take `/` after a
 /// name for that of a folder, and rename nothing to a path that ends in `/.`.

@@ -154,6 +154,13 @@ fn a_path_that_does_not_end_in_its_name_is_refused() {
 }
 
 #[test]
+fn a_dash_is_no_name_of_an_output() {
+    for kind in [TargetKind::File, TargetKind::Folder] {
+        assert!(refusal(Path::new("-"), kind, &[], Replace::Never).contains("stands for standard output"));
+    }
+}
+
+#[test]
 fn impossible_targets_are_refused() {
     let base = tempfile::tempdir().unwrap();
     write_file(&base.path().join("file"), "");
