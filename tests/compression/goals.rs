@@ -96,6 +96,15 @@ fn output_size_is_just_below_the_target() {
 }
 
 #[test]
+fn a_tsog_has_at_most_the_requested_bytes() {
+    let workplace = Workplace::new();
+    let options = "{tiny} --cameras {tiny} --no-refine --size 40KB -o small.tsog";
+    let summary = workplace.summary(options);
+    let written = bytes_written(&workplace, "small.tsog");
+    assert!(written <= 40_000 && summary["gaussians"].as_u64().unwrap() > 10, "{written} bytes, {summary}");
+}
+
+#[test]
 fn contradictory_targets_are_refused() {
     let workplace = Workplace::new();
     for (arguments, part) in [
