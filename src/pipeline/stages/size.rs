@@ -114,6 +114,26 @@ impl Sample<'_> {
     }
 }
 
+/// Returns the error for a size on disk of `most` bytes, which not even one Gaussian fits. An output with one Gaussian
+/// takes `least` bytes, of which `beside` are those of the files beside it.
+fn too_few_bytes(least: u64, beside: u64, most: u64) -> Error {
+    let written = least - beside;
+    let (parts, advice) = match beside {
+        0 => ("; nearly all of it is data other than Gaussians, such as a deformation network".to_owned(), ""),
+        _ => (
+            format!(
+                ": {written} bytes of its file or folder, with the deformation network if the model has one, and \
+                 {beside} of the files beside it (index map with 8 bytes for each Gaussian of the input, recipe, summary)"
+            ),
+            ", or write an archive (NAME.gsz): the files beside it do not count",
+        ),
+    };
+    Error::usage(format!(
+        "--size: expected at least {least} bytes, found {most}\n  {least} bytes is the size of an output with one \
+         Gaussian{parts}\n  ask for more bytes{advice}"
+    ))
+}
+
 /// Limit on the bytes of all output files together.
 #[derive(Debug, Clone)]
 struct ByteLimit {
@@ -204,10 +224,7 @@ impl ByteLimit {
             let one = 1.min(all);
             let least = bytes(one)?;
             if least > most {
-                return Err(Error::usage(format!(
-                    "--size: expected at least {least} bytes, the size of an output with one Gaussian (nearly \
-                     all of it is not Gaussians), found {most}"
-                )));
+                return Err(too_few_bytes(least, beside, most));
             }
             // Numbers of Gaussians with their bytes: `fits` is the largest number that fits, `over` the smallest that
             // does not.
