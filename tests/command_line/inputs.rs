@@ -27,7 +27,7 @@ fn recovering_no_frame_fails_and_writes_nothing() {
 fn result_without_gaussians_is_an_error() {
     let workplace = Workplace::new();
     for options in ["-o out", "-o out.gseq --prune-only", "-o out.gsz", "-o out --no-refine"] {
-        let parts = ["at least one Gaussian that stays", "none of 300", "--drop-ids"];
+        let parts = ["at least one Gaussian that stays", "none of 300, 300 of which --drop-ids"];
         workplace.refused(1, &format!("compress {{tiny}} --drop-ids 0-299 --quiet {options}"), &parts);
     }
 }
