@@ -33,6 +33,14 @@ fn result_without_gaussians_is_an_error() {
 }
 
 #[test]
+fn a_converted_file_that_is_larger_than_its_input_says_so() {
+    let workplace = Workplace::new();
+    let text = workplace.done("convert {tiny} x.ftgs.ply");
+    assert!(text.contains("larger than its input") && text.contains("motions fitted to them"), "{text}");
+    assert!(!workplace.done("convert {tiny} x.spz --frames 1").contains("larger than its input"));
+}
+
+#[test]
 fn unknown_output_extension_is_refused_with_choices() {
     let workplace = Workplace::new();
     let parts = ["x.txt", "NAME.gsz", "NAME.gseq", "NAME.ply", "a folder", "--as"];
