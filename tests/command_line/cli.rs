@@ -134,6 +134,8 @@ fn misuse_exits_with_2() {
         ("compress {tiny} -o out --keep-ids 300", "below 300"),
         ("compress {tiny} -o out --keep-ids 3 --drop-ids 3", "Gaussian 3"),
         ("compress {tiny} -o out --threads 0", "--threads"),
+        ("compress {tiny} -o out --threads a", "from 1 to 1024"),
+        ("compress {tiny} -o out --count 10%", "write --ratio 10%"),
         ("compress {tiny} -o out --split none", "--split"),
         ("compress {tiny} -o missing/out", "missing"),
         ("score {tiny} -o rows.txt", ".npz or .csv"),
@@ -164,8 +166,6 @@ fn a_slash_after_an_output_file_is_refused_before_any_work() {
 }
 
 #[test]
-fn recipes_with_unknown_or_impossible_values_are_refused() {
-#[test]
 fn a_dash_is_an_output_of_convert_alone() {
     let workplace = Workplace::new();
     for arguments in ["compress {tiny} --no-refine --ratio 10% -o -", "view {tiny} -o -", "man -", "sweep {tiny} -o -"]
@@ -174,6 +174,8 @@ fn a_dash_is_an_output_of_convert_alone() {
     }
 }
 
+#[test]
+fn recipes_with_unknown_or_impossible_values_are_refused() {
     let workplace = Workplace::new();
     for (text, part) in [
         ("[score]\nnu = 1.0\n", "nu"),
