@@ -220,6 +220,20 @@ mod tests {
     }
 
     #[test]
+    fn a_damaged_jpeg_is_no_panic() {
+        let (file, _) = written_jpeg(image::ExtendedColorType::Rgb8);
+        let whole = std::fs::read(file.path()).unwrap();
+        for at in 3..whole.len() {
+            let mut damaged = whole.clone();
+            damaged[at] ^= 0xff;
+            std::fs::write(file.path(), damaged).unwrap();
+            if let Ok(image) = read_image(file.path(), (40, 24), [0.0; 3]) {
+                assert_eq!(image.data.len(), 3 * 40 * 24, "byte {at}");
+            }
+        }
+    }
+
+    #[test]
     fn a_jpeg_of_another_size_or_cut_short_is_refused() {
         let (file, _) = written_jpeg(image::ExtendedColorType::Rgb8);
         let message = |size| read_image(file.path(), size, [0.0; 3]).unwrap_err().to_string();
