@@ -33,7 +33,7 @@ impl CacheDir {
     pub(super) fn open_or_create(folder: &Path, about: String) -> Result<CacheDir> {
         match fs::create_dir(folder) {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
-                Err(Error::io("create the work folder", folder)(error))
+                Err(Error::io("create the cache folder", folder)(error))
             }
             _ if !folder.is_dir() => Err(Error::usage(format!("{}: expected a folder, found a file", folder.shown()))),
             _ => {
@@ -123,7 +123,7 @@ impl CacheDir {
 
     /// Checks that the work folder still exists. A vanished folder is an error, not an empty cache.
     fn check_exists(&self) -> Result<()> {
-        fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the work folder", &self.folder))
+        fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the cache folder", &self.folder))
     }
 
     /// Writes a cache entry `name` with the value `value`.

@@ -79,8 +79,8 @@ impl EntryName {
 /// Returns the parsed file names of all cache entries in `folder`, sorted.
 pub(super) fn names(folder: &Path) -> Result<Vec<EntryName>> {
     let mut found = Vec::new();
-    for entry in fs::read_dir(folder).map_err(Error::io("read the work folder", folder))? {
-        let entry = entry.map_err(Error::io("read the work folder", folder))?;
+    for entry in fs::read_dir(folder).map_err(Error::io("read the cache folder", folder))? {
+        let entry = entry.map_err(Error::io("read the cache folder", folder))?;
         found.extend(entry.file_name().to_str().and_then(EntryName::parse));
     }
     found.sort();

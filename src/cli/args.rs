@@ -13,7 +13,7 @@ pub(super) use self::shared::{
     SplitArg, Trained, ZeroRotationArg,
 };
 pub(super) use self::study::{PrecisionArgs, Sweep};
-use self::values::{parse_box, parse_bytes, parse_color, parse_decibels, parse_ratio};
+use self::values::{parse_box, parse_bytes, parse_color, parse_count, parse_decibels, parse_ratio, parse_threads};
 use super::recipe_flags::RecipeFlags;
 use splatsieve::diagnostics::demo_scene::Playground;
 use splatsieve::outputs::bounds::MaxError;
@@ -38,7 +38,7 @@ pub(super) struct Cli {
     #[command(subcommand)]
     pub(super) command: CommandArgs,
     /// Number of threads; does not change the result [default: all cores]
-    #[arg(long, global = true, help_heading = MACHINE, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(long, global = true, help_heading = MACHINE, value_name = "N", value_parser = parse_threads)]
     pub(super) threads: Option<u16>,
     /// Show no progress
     #[arg(long, global = true, help_heading = MACHINE)]
@@ -182,7 +182,7 @@ pub(super) struct OutputSize {
     #[arg(long, help_heading = HOW_SMALL, value_name = "FRACTION", group = "size_of_output", value_parser = parse_ratio)]
     pub(super) ratio: Option<f64>,
     /// Number of Gaussians to keep, exactly
-    #[arg(long, help_heading = HOW_SMALL, value_name = "N", group = "size_of_output")]
+    #[arg(long, help_heading = HOW_SMALL, value_name = "N", group = "size_of_output", value_parser = parse_count)]
     pub(super) count: Option<u64>,
     /// Best output of at most this many bytes, such as 5MB
     ///

@@ -15,6 +15,7 @@ use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, Targ
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::Attributes;
+use crate::models::ModelSize;
 use crate::outputs::kind::{OutputKind, check_folder_name};
 use crate::outputs::time_windows::{MAX_SINGLE_FRAME_GAUSSIANS, is_windowed};
 use crate::passes::TRACKS_PER_BLOCK;
@@ -86,13 +87,13 @@ pub fn convert(
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
     notes.extend(kind.motion_note(frames).map(str::to_owned));
-    let mut write = |path: &Path| -> Result<u64> {
+    let mut write = |path: &Path| -> Result<ModelSize> {
         notes.extend(model.write(&all, kind, path, &plan.limits, &input.events)?);
-        Ok(model.size_written(kind, path)?.total())
+        model.size_written(kind, path)
     };
-    let bytes = if kind.is_folder() {
+    let size = if kind.is_folder() {
         let staged = StagedFolder::new(output, overwrite)?;
-        let bytes = write(staged.path())?;
+        let size = write(staged.path())?;
         let marker = serde_json::json!({
             "tool": TOOL,
             "input": InputSummary::new(model, &input.path, model.digest()?)?.without_folder_paths(),
@@ -100,15 +101,16 @@ pub fn convert(
         let path = staged.path().join(SUMMARY_FILE);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
         staged.commit()?;
-        bytes
+        size
     } else {
         let staged = StagedFile::new(output, overwrite)?;
-        let bytes = write(staged.path())?;
+        let size = write(staged.path())?;
         staged.commit()?;
-        bytes
+        size
     };
     let frames = if kind.motion_note(frames).is_some() { 1 } else { frames };
-    Ok(ConvertReport { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
+    let (bytes, larger) = (size.total(), size.why_larger_than(&model.size()?));
+    Ok(ConvertReport { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger, notes })
 }
 
 /// Returns the resource estimate (memory and time) of writing all frames once in the format `kind`, including the fit

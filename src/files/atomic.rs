@@ -26,7 +26,7 @@ pub use destination::{Replace, TargetKind};
 use leftovers::clean_up;
 pub use leftovers::remove_leftovers;
 pub use ownership::SUMMARY_FILE;
-use ownership::{add_file_list, entries, exists, files_below, split_target};
+use ownership::{add_file_list, check_ending, check_no_stream, entries, exists, files_below, split_target};
 pub use stream::is_standard_output_used;
 pub use warnings::take_warnings;
 pub use workspace::{ExitGuard, remove_unfinished};
@@ -39,6 +39,8 @@ use workspace::{SCRATCH, Workspace, user_path};
 /// Refuses these targets:
 ///
 /// - a target without a name, or in a folder that does not exist
+/// - `-`, which stands for standard output
+/// - a file whose name is followed by `/`, and a file or folder whose name is followed by `/.`
 /// - a target that is an input, contains an input or lies inside an input, even if the path leads there only through
 ///   links; this holds for every value of `replace`
 /// - an existing target that `replace` does not allow replacing (a folder may always replace an empty folder)
@@ -49,6 +51,8 @@ use workspace::{SCRATCH, Workspace, user_path};
 /// Fails with [`Error::Usage`] in each of these cases, and if a system call fails.
 pub fn check_target(target: &Path, kind: TargetKind, inputs: &[&Path], replace: Replace) -> Result<()> {
     let shown = target.shown();
+    check_no_stream(target)?;
+    check_ending(target, kind == TargetKind::Folder)?;
     let real_parent = real_parent(target)?;
     let (_, name) = split_target(target)?;
     // Compare both the entry `target` and the file that it links to. Renaming over a link replaces only the link, but a

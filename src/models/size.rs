@@ -70,8 +70,8 @@ impl ModelSize {
         let (after, whole) = (self.total(), before.total());
         let why = match (self.frames > 0, before.frames > 0) {
             (true, false) => {
-                "it holds the states of every frame, while the input holds parameters from which all \
-                              frames are computed"
+                "it holds the states of every frame or motions fitted to them, while the input holds parameters from \
+                 which all frames are computed"
             }
             _ => "the input stores its values in fewer bytes than this output format",
         };

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use crate::error::{Error, ShowPath};
 use crate::files::checkpoint::{has_legacy_magic, legacy_format};
-use crate::files::names::shown_name;
+use crate::files::names::{has_ending, shown_name};
 use crate::files::open::open_file;
 
 /// Layout of a kind of model folder: paths, relative to the folder, of the files by which it is recognized.
@@ -88,7 +88,13 @@ pub(super) fn unrecognized_folder(path: &Path) -> Error {
 
 /// Returns the error for the file at `path`, which has none of the input formats.
 pub(super) fn unrecognized_file(path: &Path) -> Error {
-    Error::input(path, "", "a model or frames in a file", "a file of none of the known formats").hint(layouts())
+    let error = |found: &str| Error::input(path, "", "a model or frames in a file", found).hint(layouts());
+    for ending in ["4dgs", "gsd"] {
+        if has_ending(path, &format!(".{ending}")) {
+            return error(&format!("a .{ending}, which this program writes but does not read"));
+        }
+    }
+    error("a file of none of the known formats")
 }
 
 /// Returns a text with one line for each kind of input that can be read.
@@ -164,6 +170,15 @@ mod tests {
     fn a_model_one_level_down_is_found() {
         let text = message(&["output/point_cloud/iteration_7/point_cloud.ply", "notes.txt"]);
         assert!(text.contains("one level down") && text.contains("output"), "{text}");
+    }
+
+    #[test]
+    fn files_that_are_only_written_are_named() {
+        for name in ["a.4dgs", "a.GSD"] {
+            let text = unrecognized_file(Path::new(name)).to_string();
+            assert!(text.contains("writes but does not read"), "{text}");
+        }
+        assert!(unrecognized_file(Path::new("a.txt")).to_string().contains("none of the known formats"));
     }
 
     #[test]

@@ -186,7 +186,8 @@ fn recipe_text(input_digest: &str, plan: &RunPlan, request: &Request, journal: &
 /// Returns the error for a result without any Gaussian, which no renderer could show.
 fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
     let all = scored.gaussian_count();
-    let dropped = scored.selection.counts.forced_drop;
+    // The ranking leaves out the Gaussians that are dropped in any case.
+    let dropped = all - scored.selection.ranking.order().len();
     let found = match dropped {
         0 => format!("none of {all}"),
         _ => format!("none of {all}, {dropped} of which --drop-ids or --set non_finite=drops"),

@@ -7,9 +7,13 @@ use hashbrown::HashMap;
 
 use super::work::add_file_stamps;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::image::{measure, read_png};
+use crate::files::image::{measure, read_image};
 use crate::model::{Camera, FrameView, Rig};
 use crate::render::Image;
+
+/// Endings of the names of photographs that are found by the numbers of frame and view, in the order in which they are
+/// tried.
+const ENDINGS: [&str; 4] = ["png", "jpg", "jpeg", "JPG"];
 
 /// Paths of the photographs of some views.
 pub struct Photographs {
@@ -53,6 +57,8 @@ impl Photographs {
     /// - else `camNN/images/FFFF.png` as in DyNeRF, with the number of the frame. The folders `cam…`, sorted by their
     ///   numbers, belong to the views 0, 1, 2 and so on.
     ///
+    /// Instead of `png`, the ending may be another one of [`ENDINGS`].
+    ///
     /// # Errors
     /// Fails if the folder cannot be read, if no view has a photograph, or if two views have the same photograph.
     pub fn find(
@@ -70,15 +76,7 @@ impl Photographs {
             found = views.iter().copied().filter_map(numbered).collect();
         }
         if let (true, Some(&view)) = (found.is_empty(), views.first()) {
-            let named = rig.image_path(view, times).and_then(Path::file_name);
-            let named = named.map_or_else(String::new, |name| format!(", {}", name.shown()));
-            let expected = format!("{}.png{named} or {}", view.name(), in_rig(Path::new("camNN"), view).shown());
-            return Err(Error::input(
-                folder,
-                view_name(view),
-                expected,
-                "no such file, and no photograph of any other view",
-            ));
+            return Err(none_found(folder, view, rig.image_path(view, times)));
         }
         let views = found.iter().map(|(view, _)| *view).collect();
         Ok((views, Photographs::from_files(folder, found.into_iter().map(Ok))?))
@@ -108,7 +106,7 @@ impl Photographs {
     /// photograph; of the others, reads only the image size. `cameras`: cameras of the views, by camera index.
     ///
     /// # Errors
-    /// Fails if the first file is not a PNG, or if a file is not an image of its camera's size.
+    /// Fails if the first file is not a PNG or JPEG, or if a file is not an image of its camera's size.
     pub fn check_files(&self, views: &[FrameView], cameras: &[Camera]) -> Result<()> {
         if let Some(&first) = views.first() {
             self.read(first, &cameras[first.camera as usize], [0.0; 3])?;
@@ -116,7 +114,7 @@ impl Photographs {
         for view in views {
             let Some(file) = self.files.get(&(view.frame, view.view)) else { continue };
             let camera = &cameras[view.camera as usize];
-            let expected = format!("a PNG of {}x{} pixels, the size of the camera", camera.width, camera.height);
+            let expected = format!("an image of {}x{} pixels, the size of the camera", camera.width, camera.height);
             let found = match measure(file) {
                 Some(size) if size == (camera.width, camera.height) => continue,
                 Some((width, height)) => format!("{width}x{height} pixels"),
@@ -134,7 +132,7 @@ impl Photographs {
     pub fn read(&self, view: FrameView, camera: &Camera, background: [f32; 3]) -> Result<Image> {
         let file = self.files.get(&(view.frame, view.view));
         let file = file.ok_or_else(|| Error::usage(format!("no photograph was found for {}", view.name())))?;
-        read_png(file, (camera.width, camera.height), background)
+        read_image(file, (camera.width, camera.height), background)
     }
 }
 
@@ -151,12 +149,25 @@ fn check_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Finds the photograph of `view` by its frame and view number: `tNNN_vNN.png` (frame, view) in `folder`, else the
-/// frame's file in the folder of the view number in `cameras`. Returns `None` if neither file exists.
+/// Returns the error for a folder without a photograph of any view. `view` is the first view, and `named` the path of
+/// its image in the camera file.
+fn none_found(folder: &Path, view: FrameView, named: Option<&Path>) -> Error {
+    let numbered = format!("{}.png", view.name());
+    let named = named.and_then(Path::file_name).filter(|name| *name != numbered.as_str());
+    let names = named.into_iter().map(|name| name.shown().to_string()).chain([numbered]);
+    let expected = format!("{} or {}", names.collect::<Vec<_>>().join(", "), in_rig(Path::new("camNN"), view).shown());
+    Error::input(folder, view_name(view), expected, "no such file, and no photograph of any other view")
+        .hint("name the photographs like this; they are PNG or JPEG files, and the ending may also be .jpg or .jpeg")
+}
+
+/// Finds the photograph of `view` by its frame and view number: `tNNN_vNN` (frame, view) in `folder`, else the frame's
+/// file in the folder of the view number in `cameras`, each with one of [`ENDINGS`]. Returns `None` if no such file
+/// exists.
 fn numbered_file(folder: &Path, view: FrameView, cameras: &[PathBuf]) -> Option<PathBuf> {
     let in_camera = cameras.get(view.view as usize).map(|camera| in_rig(camera, view));
     let files = [Some(folder.join(format!("{}.png", view.name()))), in_camera];
-    files.into_iter().flatten().find(|file| file.is_file())
+    let mut files = files.into_iter().flatten().flat_map(|file| ENDINGS.map(|ending| file.with_extension(ending)));
+    files.find(|file| file.is_file())
 }
 
 /// Returns the subfolders of `folder` whose name is `cam` and a number and that contain a folder `images`, in the order

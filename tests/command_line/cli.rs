@@ -134,12 +134,43 @@ fn misuse_exits_with_2() {
         ("compress {tiny} -o out --keep-ids 300", "below 300"),
         ("compress {tiny} -o out --keep-ids 3 --drop-ids 3", "Gaussian 3"),
         ("compress {tiny} -o out --threads 0", "--threads"),
+        ("compress {tiny} -o out --threads a", "from 1 to 1024"),
+        ("compress {tiny} -o out --count 10%", "write --ratio 10%"),
         ("compress {tiny} -o out --split none", "--split"),
         ("compress {tiny} -o missing/out", "missing"),
         ("score {tiny} -o rows.txt", ".npz or .csv"),
         ("recipe --preset reckless", "reckless"),
     ] {
         workplace.refused(2, arguments, &[part]);
+    }
+}
+
+#[test]
+fn a_slash_after_an_output_file_is_refused_before_any_work() {
+    let workplace = Workplace::new();
+    for arguments in [
+        "compress {tiny} --no-refine --ratio 10% -o y.gsz/",
+        "compress {tiny} --no-refine --ratio 10% -o y.ply/ --dry-run",
+        "compress {tiny} --no-refine --ratio 10% -o y.gsz --view=y.html/",
+        "convert {tiny} y.gseq/",
+        "convert {tiny} y.ply/",
+        "convert {tiny} y.gsz/",
+        "view {tiny} -o y.html/",
+        "score {tiny} -o y.csv/",
+        "render {tiny} --cameras {tiny} --frame 0 --view 0 -o y.png/",
+        "render {tiny} --cameras {tiny} --video y.png/",
+        "evaluate {tiny} {tiny} --cameras {tiny} --csv y.csv/",
+    ] {
+        workplace.refused(2, arguments, &["found a path that ends in '/'", "follows the name: y."]);
+    }
+}
+
+#[test]
+fn a_dash_is_an_output_of_convert_alone() {
+    let workplace = Workplace::new();
+    for arguments in ["compress {tiny} --no-refine --ratio 10% -o -", "view {tiny} -o -", "man -", "sweep {tiny} -o -"]
+    {
+        workplace.refused(2, arguments, &["-: expected the name of a file", "convert NAME.gseq -"]);
     }
 }
 

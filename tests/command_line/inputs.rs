@@ -5,7 +5,9 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use crate::scene::{Workplace, program, tiny};
+use crate::scene::{Workplace, files, program, tiny};
+use splatsieve::files::image::read_image;
+use splatsieve::files::image::write::jpeg_bytes;
 
 #[test]
 fn recovering_no_frame_fails_and_writes_nothing() {
@@ -25,9 +27,17 @@ fn recovering_no_frame_fails_and_writes_nothing() {
 fn result_without_gaussians_is_an_error() {
     let workplace = Workplace::new();
     for options in ["-o out", "-o out.gseq --prune-only", "-o out.gsz", "-o out --no-refine"] {
-        let parts = ["at least one Gaussian that stays", "none of 300", "--drop-ids"];
+        let parts = ["at least one Gaussian that stays", "none of 300, 300 of which --drop-ids"];
         workplace.refused(1, &format!("compress {{tiny}} --drop-ids 0-299 --quiet {options}"), &parts);
     }
+}
+
+#[test]
+fn a_converted_file_that_is_larger_than_its_input_says_so() {
+    let workplace = Workplace::new();
+    let text = workplace.done("convert {tiny} x.ftgs.ply");
+    assert!(text.contains("larger than its input") && text.contains("motions fitted to them"), "{text}");
+    assert!(!workplace.done("convert {tiny} x.spz --frames 1").contains("larger than its input"));
 }
 
 #[test]
@@ -241,7 +251,30 @@ fn ground_truth_is_compared_and_counted_where_it_exists() {
     assert!(commas.windows(2).all(|pair| pair[0] == pair[1]), "{csv}");
     fs::remove_dir_all(workplace.path("photos")).unwrap();
     fs::create_dir(workplace.path("photos")).unwrap();
-    workplace.refused(1, line, &["photos", "no such file, and no photograph of any other view"]);
+    let parts = ["photos, frame ", "no such file, and no photograph of any other view", "PNG or JPEG files"];
+    workplace.refused(1, line, &parts);
+}
+
+#[test]
+fn photographs_may_be_jpeg_files() {
+    let workplace = Workplace::new();
+    let line = "evaluate {tiny} {tiny} --cameras {tiny} --json --ground-truth photos";
+    let measured = || -> serde_json::Value { serde_json::from_str(&workplace.done(line)).unwrap() };
+    workplace.done("render {tiny} --cameras {tiny} --split test --all -o photos --quiet");
+    let of_png = measured();
+    for (name, bytes) in files(&workplace.path("photos")) {
+        if name.extension().is_some_and(|ending| ending == "png") {
+            let path = workplace.path("photos").join(&name);
+            let size = imagesize::blob_size(&bytes).unwrap();
+            let image = read_image(&path, (size.width as u32, size.height as u32), [0.0; 3]).unwrap();
+            fs::write(path.with_extension("jpg"), jpeg_bytes(&image, 100).unwrap()).unwrap();
+            fs::remove_file(path).unwrap();
+        }
+    }
+    let of_jpeg = measured();
+    assert_eq!(of_png["ground_truth"]["pairs"], of_jpeg["ground_truth"]["pairs"]);
+    let psnr = of_jpeg["ground_truth"]["original"]["psnr"].as_f64().unwrap();
+    assert!(psnr > 35.0, "{psnr} dB");
 }
 
 #[test]

@@ -353,7 +353,7 @@ fn cache_folder_is_listed_and_cleaned() {
     fs::remove_file(workplace.path("work/mine.txt")).unwrap();
     assert_eq!(workplace.done("cache work"), "no results are stored here\n");
     workplace.done("cache work --clean");
-    workplace.refused(1, "cache work", &["work"]);
+    workplace.refused(1, "cache work", &["the cache folder work"]);
 }
 
 #[test]

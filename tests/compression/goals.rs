@@ -96,6 +96,25 @@ fn output_size_is_just_below_the_target() {
 }
 
 #[test]
+fn sizes_that_are_too_small_are_explained() {
+    let workplace = Workplace::new();
+    let line = "compress {tiny} --no-refine -o small.gseq --size";
+    let parts = ["expected at least ", "found 10000", "one Gaussian: ", "index map with 8 bytes for each Gaussian"];
+    workplace.refused(2, &format!("{line} 10KB"), &parts);
+    let parts = ["--size: ", " Gaussians fit the size, but 300 are to be kept"];
+    workplace.refused(2, &format!("{line} 60KB --keep-box=-99,-99,-99,99,99,99"), &parts);
+}
+
+#[test]
+fn a_tsog_has_at_most_the_requested_bytes() {
+    let workplace = Workplace::new();
+    let options = "{tiny} --cameras {tiny} --no-refine --size 40KB -o small.tsog";
+    let summary = workplace.summary(options);
+    let written = bytes_written(&workplace, "small.tsog");
+    assert!(written <= 40_000 && summary["gaussians"].as_u64().unwrap() > 10, "{written} bytes, {summary}");
+}
+
+#[test]
 fn contradictory_targets_are_refused() {
     let workplace = Workplace::new();
     for (arguments, part) in [

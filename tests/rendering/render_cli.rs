@@ -368,7 +368,7 @@ fn wrong_inputs_exit_with_1_and_leave_no_files() {
     small.write_header().unwrap().write_image_data(&[0; 6]).unwrap();
     refused(folder.path(), evaluate, 1, &["t003_v02.png", "48 x 36", "2 x 1"]);
     fs::write(&photo, "no image").unwrap();
-    refused(folder.path(), evaluate, 1, &["t003_v02.png", "a PNG image"]);
+    refused(folder.path(), evaluate, 1, &["t003_v02.png", "a PNG or JPEG image"]);
     refused(folder.path(), "evaluate scene.gseq none.gseq --cameras cameras.json", 1, &["none.gseq"]);
 }
 

@@ -47,6 +47,20 @@ pub(super) fn parse_ratio(text: &str) -> Result<f64, String> {
     }
 }
 
+/// Parses a number of Gaussians.
+pub(super) fn parse_count(text: &str) -> Result<u64, String> {
+    text.trim().parse().map_err(|_| {
+        let ratio = parse_ratio(text).map_or(String::new(), |_| format!("; write --ratio {text} for a fraction"));
+        format!("expected a number of Gaussians such as 5000, found {}{ratio}", quoted(text))
+    })
+}
+
+/// Parses a number of threads.
+pub(super) fn parse_threads(text: &str) -> Result<u16, String> {
+    let threads = text.parse().ok().filter(|threads| (1..=1024).contains(threads));
+    threads.ok_or_else(|| format!("expected a whole number from 1 to 1024, found {}", quoted(text)))
+}
+
 /// Parses the source of image times: `names`, `none` or the path of a table.
 pub(super) fn parse_times(text: &str) -> Result<TimesSource, String> {
     Ok(TimesSource::parse(text))
@@ -84,5 +98,23 @@ pub(super) fn parse_box(text: &str) -> Result<[f64; 6], String> {
     match (0..3).find(|&axis| !in_order(axis)) {
         Some(axis) => Err(format!("axis {axis}: {} is not below {}", corners[axis], corners[axis + 3])),
         None => Ok(corners),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_that_are_none_are_refused_with_the_expected_ones() {
+        let message = parse_count("10%").unwrap_err();
+        assert!(message.contains("expected a number of Gaussians") && message.contains("--ratio 10%"), "{message}");
+        assert!(parse_count("-3").unwrap_err().ends_with("such as 5000, found \"-3\""));
+        assert_eq!(parse_count("5000"), Ok(5000));
+        for text in ["a", "0", "1025", "2.5", ""] {
+            let message = parse_threads(text).unwrap_err();
+            assert!(message.contains("from 1 to 1024, found "), "{message}");
+        }
+        assert_eq!(["1", "1024"].map(parse_threads), [Ok(1), Ok(1024)]);
     }
 }

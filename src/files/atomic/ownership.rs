@@ -216,3 +216,33 @@ pub(super) fn split_target(target: &Path) -> Result<(PathBuf, &OsStr)> {
     let parent = target.parent().filter(|parent| !parent.as_os_str().is_empty());
     Ok((parent.unwrap_or(Path::new(".")).to_owned(), name))
 }
+
+/// Checks that the output path `target` is not `-`, which other programs take for standard output.
+pub(super) fn check_no_stream(target: &Path) -> Result<()> {
+    match target == Path::new("-") {
+        true => Err(Error::usage(
+            "-: expected the name of a file or folder to write, found '-', which stands for standard output\n  \
+             only `splatsieve convert NAME.gseq -` writes there, a frame stream; ./- is a file or folder named '-'",
+        )),
+        false => Ok(()),
+    }
+}
+
+/// Checks that the output path `target` ends in the name of the output, which is a folder if `is_folder` is set.
+/// `file_name` of the standard library ignores `/` and `/.` after a name, but system calls do not: they take `/` after a
+/// name for that of a folder, and rename nothing to a path that ends in `/.`.
+pub(super) fn check_ending(target: &Path, is_folder: bool) -> Result<()> {
+    let (_, name) = split_target(target)?;
+    let path = target.to_string_lossy();
+    let path = if is_folder { path.trim_end_matches(std::path::is_separator) } else { &path };
+    if path.ends_with(&*name.to_string_lossy()) {
+        return Ok(());
+    }
+    let (expected, ending) = if is_folder { ("folder", "/.") } else { ("file", "/") };
+    Err(Error::usage(format!(
+        "{}: the output is a {expected}: expected its name, found a path that ends in '{ending}'\n  \
+         leave out what follows the name: {}",
+        target.shown(),
+        target.with_file_name(name).shown()
+    )))
+}

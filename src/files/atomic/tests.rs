@@ -142,6 +142,25 @@ fn folder_that_becomes_foreign_during_the_run_is_kept() {
 }
 
 #[test]
+fn a_path_that_does_not_end_in_its_name_is_refused() {
+    let base = tempfile::tempdir().unwrap();
+    for ending in ["/", "//", "/.", "/./"] {
+        let target = base.path().join(format!("out.ply{ending}"));
+        let text = refusal(&target, TargetKind::File, &[], Replace::Never);
+        assert!(text.contains("found a path that ends in '/'") && text.ends_with("/out.ply"), "{text}");
+        let as_folder = check_target(&target, TargetKind::Folder, &[], Replace::Never);
+        assert_eq!(as_folder.is_ok(), !ending.contains('.'), "{ending}: {as_folder:?}");
+    }
+}
+
+#[test]
+fn a_dash_is_no_name_of_an_output() {
+    for kind in [TargetKind::File, TargetKind::Folder] {
+        assert!(refusal(Path::new("-"), kind, &[], Replace::Never).contains("stands for standard output"));
+    }
+}
+
+#[test]
 fn impossible_targets_are_refused() {
     let base = tempfile::tempdir().unwrap();
     write_file(&base.path().join("file"), "");

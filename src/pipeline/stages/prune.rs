@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::memory_plan::ResourceEstimate;
 use crate::pipeline::planning::Planning;
+use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
@@ -40,6 +41,12 @@ impl Stage for Prune {
         let most = ranking.order().len();
         // With a byte limit, the number of Gaussians that fit may exceed the number of Gaussians that may stay.
         let target = run.target.map(|target| if run.request.goal.is_some() { target.min(most) } else { target });
+        let protected = scored.protected.len();
+        if let (Some(Goal::Bytes(_)), Some(target)) = (&run.request.goal, target.filter(|&target| target < protected)) {
+            return Err(Error::usage(format!(
+                "--size: {target} Gaussians fit the size, but {protected} are to be kept\n  ask for more bytes, or keep fewer"
+            )));
+        }
         run.refine_to = self.survivors(run.scene, &scored, &ranking, target, &mut run.journal)?;
         let survivors = run.stages.counts.count_before_refinement(run.refine_to, scored.gaussian_count()).min(most);
         run.result = run.template.with_kept(ranking.best_ids(survivors));

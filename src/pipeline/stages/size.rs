@@ -65,9 +65,9 @@ impl Stage for CountByBytes {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let template = CompressedModel { field: self.limit.field, ..run.template.clone() };
-        let (present, recipe) = (run.scored()?.present_ids(), run.recipe.len() as u64);
+        let (scored, recipe) = (run.scored()?, run.recipe.len() as u64);
         run.counts_within_bytes =
-            self.limit.fits(run.scene, (&present, recipe), &template, self.drops_bands, &mut run.journal)?;
+            self.limit.fits(run.scene, (&scored, recipe), &template, self.drops_bands, &mut run.journal)?;
         run.target = run.counts_within_bytes.first().map(|fit| fit.gaussians);
         Ok(())
     }
@@ -91,6 +91,49 @@ impl Stage for ShrinkToBytes {
     }
 }
 
+/// Gaussians of which samples are written to measure the size of outputs.
+struct Sample<'a> {
+    /// Ids of all Gaussians that an output can hold, increasing.
+    ids: &'a [u32],
+    /// Gaussian that is in every sample: the best one of the ranking, for an output that cannot hold only Gaussians that
+    /// are never visible; `None` for other outputs.
+    best: Option<u32>,
+}
+
+impl Sample<'_> {
+    /// Returns `count` of the Gaussians, evenly spaced, in increasing order. If `best` is not among them, it replaces
+    /// the first.
+    fn pick(&self, count: usize) -> Vec<u32> {
+        let mut kept: Vec<u32> = (0..count).map(|k| self.ids[k * self.ids.len() / count]).collect();
+        let best = self.best.filter(|best| kept.binary_search(best).is_err());
+        if let (Some(first), Some(best)) = (kept.first_mut(), best) {
+            *first = best;
+            kept.sort_unstable();
+        }
+        kept
+    }
+}
+
+/// Returns the error for a size on disk of `most` bytes, which not even one Gaussian fits. An output with one Gaussian
+/// takes `least` bytes, of which `beside` are those of the files beside it.
+fn too_few_bytes(least: u64, beside: u64, most: u64) -> Error {
+    let written = least - beside;
+    let (parts, advice) = match beside {
+        0 => ("; nearly all of it is data other than Gaussians, such as a deformation network".to_owned(), ""),
+        _ => (
+            format!(
+                ": {written} bytes of its file or folder, with the deformation network if the model has one, and \
+                 {beside} of the files beside it (index map with 8 bytes for each Gaussian of the input, recipe, summary)"
+            ),
+            ", or write an archive (NAME.gsz): the files beside it do not count",
+        ),
+    };
+    Error::usage(format!(
+        "--size: expected at least {least} bytes, found {most}\n  {least} bytes is the size of an output with one \
+         Gaussian{parts}\n  ask for more bytes{advice}"
+    ))
+}
+
 /// Limit on the bytes of all output files together.
 #[derive(Debug, Clone)]
 struct ByteLimit {
@@ -111,7 +154,8 @@ impl ByteLimit {
         Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
-    /// Returns how many of the Gaussians `ids` fit the byte limit ([`ByteLimit::count`]), for one or more SH degrees:
+    /// Returns how many of the Gaussians in `scored` fit the byte limit ([`ByteLimit::count`]), for one or more SH
+    /// degrees:
     /// - if `drops` is false, for the degree of `template` only;
     /// - if `drops` is true, also for lower degrees in decreasing order, up to the first degree at which all Gaussians
     ///   fit.
@@ -123,7 +167,7 @@ impl ByteLimit {
     fn fits(
         &self,
         scene: &Scene,
-        (ids, recipe): (&[u32], u64),
+        (scored, recipe): (&Scored, u64),
         template: &CompressedModel,
         drops: bool,
         journal: &mut Journal,
@@ -131,13 +175,17 @@ impl ByteLimit {
         let info = scene.source().info();
         let highest = template.sh_degree.min(info.sh_degree);
         let lowest = if drops && scene.input.reason_to_keep_sh_degree().is_none() { 0 } else { highest };
+        let present = scored.present_ids();
+        let needs_visible = self.writer.kind == OutputKind::Tsog;
+        let best = scored.selection.ranking.order().first().copied().filter(|_| needs_visible);
+        let sample = Sample { ids: &present, best };
         let mut fits: Vec<ByteLimitFit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
-            if fits.last().is_some_and(|fit| fit.gaussians == ids.len()) {
+            if fits.last().is_some_and(|fit| fit.gaussians == present.len()) {
                 break;
             }
             let template = CompressedModel { sh_degree, ..template.clone() };
-            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (ids, recipe), &template, journal)? });
+            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (&sample, recipe), &template, journal)? });
         }
         Ok(fits)
     }
@@ -149,36 +197,34 @@ impl ByteLimit {
     }
 
     /// Returns how many Gaussians an output within the byte limit can hold. Sizes are measured on evenly spaced samples
-    /// of the Gaussians `ids`. `template` holds the other settings of the model, such as the SH degree; `recipe` is the
-    /// size of the recipe file, bytes.
+    /// of the Gaussians in `sample`. `template` holds the other settings of the model, such as the SH degree; `recipe`
+    /// is the size of the recipe file, bytes.
     ///
     /// # Errors
     /// Fails if not even one Gaussian fits, if frames cannot be read, or if a write fails.
     fn count(
         &self,
         scene: &Scene,
-        (ids, recipe): (&[u32], u64),
+        (sample, recipe): (&Sample<'_>, u64),
         template: &CompressedModel,
         journal: &mut Journal,
     ) -> Result<usize> {
-        let (all, most) = (ids.len(), self.most);
-        journal.run_cached_stage(NAME, all, scene, self.key(scene, recipe, template), |_| {
+        let (all, most) = (sample.ids.len(), self.most);
+        let beside = self.writer.companion_bytes(scene, recipe);
+        let key = self.key(scene, recipe, template).extended_by(&sample.best);
+        journal.run_cached_stage(NAME, all, scene, key, |_| {
             let bytes = |count: usize| {
-                let kept = (0..count).map(|k| ids[k * all / count]).collect();
-                let some = template.with_kept(kept);
-                match self.writer.kind {
-                    // The files beside an archive are neither stored nor sent with it, so their bytes do not count.
-                    OutputKind::Archive => archive::estimated_bytes(scene, &some),
-                    _ => self.writer.output_bytes(scene, &some, recipe),
-                }
+                let some = template.with_kept(sample.pick(count));
+                let written = match self.writer.kind {
+                    OutputKind::Archive => archive::estimated_bytes(scene, &some)?,
+                    _ => self.writer.output_bytes(scene, &some)?,
+                };
+                Ok::<u64, Error>(written + beside)
             };
             let one = 1.min(all);
             let least = bytes(one)?;
             if least > most {
-                return Err(Error::usage(format!(
-                    "--size: expected at least {least} bytes, the size of an output with one Gaussian (nearly \
-                     all of it is not Gaussians), found {most}"
-                )));
+                return Err(too_few_bytes(least, beside, most));
             }
             // Numbers of Gaussians with their bytes: `fits` is the largest number that fits, `over` the smallest that
             // does not.
@@ -221,7 +267,8 @@ impl ByteLimit {
     ) -> Result<CompressedModel> {
         let key = self.key(scene, recipe, &compressed).extended_by(&scored.protected);
         journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
-            let bytes = |compressed: &CompressedModel| self.writer.output_bytes(scene, compressed, recipe);
+            let beside = self.writer.companion_bytes(scene, recipe);
+            let bytes = |some: &CompressedModel| Ok::<u64, Error>(self.writer.output_bytes(scene, some)? + beside);
             let empty = bytes(&compressed.pick(&[]))?;
             let mut tried = 0;
             loop {
@@ -275,6 +322,18 @@ fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_sample_holds_the_best_gaussian_and_is_increasing() {
+        let ids = [2, 3, 5, 8, 13, 21];
+        let picked = |best, count| Sample { ids: &ids, best }.pick(count);
+        assert_eq!(picked(None, 3), [2, 5, 13]);
+        assert_eq!(picked(Some(8), 1), [8]);
+        assert_eq!(picked(Some(8), 3), [5, 8, 13]);
+        assert_eq!(picked(Some(5), 3), [2, 5, 13]);
+        assert_eq!(picked(Some(8), 6), ids);
+        assert!(picked(Some(8), 0).is_empty());
+    }
 
     #[test]
     fn shrinking_ends_whatever_the_bytes_are() {

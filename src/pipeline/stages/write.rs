@@ -258,19 +258,29 @@ impl WriteStage {
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
-    /// Returns the total size, in bytes, of all output files for the model `compressed`. Measures it by writing the
-    /// result to a scratch folder, which is then deleted. `recipe` is the size of the recipe file in bytes; for the
-    /// summary, an assumed maximum size is counted.
+    /// Returns the size in bytes of the output for the model `compressed`, without the files beside it. Measures it by
+    /// writing the result to a scratch folder, which is then deleted.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
-    pub fn output_bytes(&self, scene: &Scene, compressed: &CompressedModel, recipe: u64) -> Result<u64> {
+    pub fn output_bytes(&self, scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
+        // A `.tsog` without Gaussians cannot be written. It would have only a few bytes.
+        if self.kind == OutputKind::Tsog && compressed.is_empty() {
+            return Ok(0);
+        }
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
-        let written =
-            write_without_companions(&*scene.input, compressed, self.kind, &path, &scene.limits, &scene.events)?;
-        let beside = MAX_SUMMARY_BYTES + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
-        Ok(written + beside)
+        write_without_companions(&*scene.input, compressed, self.kind, &path, &scene.limits, &scene.events)
+    }
+
+    /// Returns the total size in bytes of the files beside the output (recipe, index map, summary), or 0 for an
+    /// archive: they are neither stored nor sent with it, so they do not count. `recipe` is the size of the recipe file
+    /// in bytes; for the summary, an assumed maximum size is counted.
+    pub fn companion_bytes(&self, scene: &Scene, recipe: u64) -> u64 {
+        match self.kind {
+            OutputKind::Archive => 0,
+            _ => MAX_SUMMARY_BYTES + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64,
+        }
     }
 
     /// Writes the result and the files beside it (recipe, index map, summary) under temporary names, and renames them
