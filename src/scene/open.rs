@@ -40,9 +40,9 @@ pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
         return open_packed_stream(options);
     }
     let path = &options.path;
-    let mut notes = Vec::new();
     let opened = models::open(path, &options.open_options())?;
     let rig = load_input_cameras(options, &opened)?;
+    let UntrackedInput { opened, rig, mut notes, .. } = with_cameras(options, opened, rig)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let times = match opened.timing() {
         TimeOrigin::Continuous => Some(match options.frames {
@@ -71,11 +71,8 @@ pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
     Ok(UntrackedInput { opened, rig, times, notes })
 }
 
-/// Loads the cameras that `options` name, or else the cameras found with the input `opened`. Returns `None` if there
-/// are neither. The times in a camera file may be normalized or on the scale of the frames' time stamps:
-/// - First, they are read in the time convention of the input.
-/// - If the frames of the input have time stamps and the resulting times are not among them, the times as stated in the
-///   file are tried. They are used if they are among the time stamps.
+/// Loads the cameras that `options` name, or else the cameras found with the input `opened`, in the time convention of
+/// the input. Returns `None` if there are neither.
 fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<Rig>> {
     let (model, timing, frame_times) = (opened.model(), opened.timing(), opened.times());
     let path = camera_path(options, model);
@@ -86,13 +83,29 @@ fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<
         TimesSource::Own if is_still && by_name => TimesSource::None,
         _ => options.times.clone(),
     };
-    let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, model);
-    let rig = load(model.map_or(TimeConvention::Normalized, InputModel::time_convention))?;
+    let clock = model.map_or(TimeConvention::Normalized, InputModel::time_convention);
+    load_cameras(options, path.as_deref(), times, clock, model)
+}
+
+/// Returns the input `opened`, whose frames keep their times, with its cameras `rig`, if it has any. The cameras must
+/// have been read in the time convention of the input. But the times in a camera file may be on the scale of the frames'
+/// time stamps: if the frames have time stamps, and the times of `rig` are not among them, the times as stated in the
+/// file are tried. They are used if they are among the time stamps.
+///
+/// # Errors
+/// Fails if the camera file can no longer be read.
+pub fn with_cameras(options: &InputOptions, opened: Opened, rig: Option<Rig>) -> Result<UntrackedInput> {
+    let (model, frame_times) = (opened.model(), opened.times());
     let fits = |rig: &Rig| rig.schedule(&frame_times, options.split).is_ok();
-    match rig.as_ref().is_some_and(|rig| timing == TimeOrigin::Stamped && !fits(rig)) {
-        true => Ok(load(TimeConvention::Given)?.filter(fits).or(rig)),
-        false => Ok(rig),
-    }
+    let rig = match rig {
+        Some(rig) if opened.timing() == TimeOrigin::Stamped && !fits(&rig) => {
+            let (path, times) = (camera_path(options, model), options.times.clone());
+            let given = load_cameras(options, path.as_deref(), times, TimeConvention::Given, model)?;
+            given.filter(fits).or(Some(rig))
+        }
+        rig => rig,
+    };
+    Ok(UntrackedInput { opened, rig, times: None, notes: Vec::new() })
 }
 
 /// Returns evenly spaced frame times from 0 up to but not including `span`, for a model whose cameras give no times.

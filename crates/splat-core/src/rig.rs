@@ -173,7 +173,7 @@ impl Rig {
         };
         Error::usage(format!(
             "{}: view {view} was taken at time {time}, but the sequence has no frame at this time: it {frames}\n  \
-             use the cameras of this scene, or set --frames to the number of times in the camera file",
+             use the cameras of this scene",
             self.origin,
         ))
     }
@@ -287,7 +287,7 @@ mod tests {
     fn view_without_a_frame_is_an_error_with_its_details() {
         let rig = rig(&[(0, Some(0.0), Split::Train), (3, Some(0.25), Split::Test)]);
         let message = rig.schedule(&[0.0, 0.5, 1.0], None).unwrap_err().to_string();
-        for part in ["test.json", "view 3", "0.25", "has 3 frames, from time 0 to 1", "--frames"] {
+        for part in ["test.json", "view 3", "0.25", "has 3 frames, from time 0 to 1"] {
             assert!(message.contains(part), "{part:?} is not in {message:?}");
         }
         assert!(rig.schedule(&[0.0, 0.5, 1.0], Some(Split::Train)).is_ok(), "views of other splits must be ignored");
