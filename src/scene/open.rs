@@ -74,13 +74,12 @@ pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
 /// Loads the cameras that `options` name, or else the cameras found with the input `opened`, in the time convention of
 /// the input. Returns `None` if there are neither.
 fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<Rig>> {
-    let (model, timing, frame_times) = (opened.model(), opened.timing(), opened.times());
+    let model = opened.model();
     let path = camera_path(options, model);
-    // Numbers in the image names of a still scene are not times.
-    let is_still = timing != TimeOrigin::Continuous && frame_times.len() == 1;
     let by_name = path.as_deref().is_some_and(cameras::are_timed_by_name);
     let times = match options.times {
-        TimesSource::Own if is_still && by_name => TimesSource::None,
+        // Numbers in the image names of a still scene are not times.
+        TimesSource::Own if has_one_frame(opened) && by_name => TimesSource::None,
         _ => options.times.clone(),
     };
     let clock = model.map_or(TimeConvention::Normalized, InputModel::time_convention);
@@ -92,20 +91,45 @@ fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<
 /// time stamps: if the frames have time stamps, and the times of `rig` are not among them, the times as stated in the
 /// file are tried. They are used if they are among the time stamps.
 ///
+/// If the input has only one frame, which none of these times fits, every camera sees this frame, and a note says so.
+///
 /// # Errors
 /// Fails if the camera file can no longer be read.
 pub fn with_cameras(options: &InputOptions, opened: Opened, rig: Option<Rig>) -> Result<UntrackedInput> {
     let (model, frame_times) = (opened.model(), opened.times());
-    let fits = |rig: &Rig| rig.schedule(&frame_times, options.split).is_ok();
+    let is_misfit = |rig: &Rig| match opened.timing() {
+        TimeOrigin::Continuous => false,
+        // A single frame takes the only time of its cameras.
+        TimeOrigin::Numbered => frame_times.len() == 1 && rig.times().len() > 1,
+        TimeOrigin::Stamped => rig.schedule(&frame_times, options.split).is_err(),
+    };
+    let mut notes = Vec::new();
     let rig = match rig {
-        Some(rig) if opened.timing() == TimeOrigin::Stamped && !fits(&rig) => {
+        Some(rig) if is_misfit(&rig) => {
             let (path, times) = (camera_path(options, model), options.times.clone());
             let given = load_cameras(options, path.as_deref(), times, TimeConvention::Given, model)?;
-            given.filter(fits).or(Some(rig))
+            Some(match given.filter(|given| !is_misfit(given)) {
+                Some(given) => given,
+                None if has_one_frame(&opened) => {
+                    let rig = rig.without_times();
+                    let views = rig.views.len();
+                    notes.push(format!(
+                        "one frame: its {views} views are those of {}, whose times are ignored",
+                        rig.origin
+                    ));
+                    rig
+                }
+                None => rig,
+            })
         }
         rig => rig,
     };
-    Ok(UntrackedInput { opened, rig, times: None, notes: Vec::new() })
+    Ok(UntrackedInput { opened, rig, times: None, notes })
+}
+
+/// Returns whether the input `opened` has only one frame and cannot be evaluated at other times.
+fn has_one_frame(opened: &Opened) -> bool {
+    opened.timing() != TimeOrigin::Continuous && opened.times().len() == 1
 }
 
 /// Returns evenly spaced frame times from 0 up to but not including `span`, for a model whose cameras give no times.
