@@ -22,7 +22,7 @@ use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::Attributes;
 use crate::models;
 use crate::models::stream::pack_stream;
-use crate::models::{ColumnInfo, InputModel, ModelSize, Opened, TimeOrigin};
+use crate::models::{ColumnInfo, InputModel, ModelSize, TimeOrigin};
 use crate::outputs::bounds::{ErrorBounds, MaxError};
 use crate::outputs::container::{
     FRAME_BLOCK, FRAME_BLOCK_WITH_ERROR_BOUNDS, Packing, join_container, spill_blocks, write_container,
@@ -33,8 +33,8 @@ use crate::passes::FrameReaders;
 use crate::pipeline::stages::write::ENCODE_SECONDS_PER_STATE;
 use crate::pipeline::summary::InputSummary;
 use crate::scene::{
-    InputOptions, OpenedInput, UntrackedInput, first_frame_box, frame_quota, is_linked, open_cache, open_input,
-    open_stream, receive_unlinked,
+    InputOptions, OpenedInput, first_frame_box, frame_quota, is_linked, open_cache, open_input, open_stream,
+    receive_untracked,
 };
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
@@ -92,8 +92,7 @@ fn pack_whole(
     check_target(output, TargetKind::File, &[&input.path], overwrite)?;
     let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {
         Some(stream) if is_linked(stream.header(), input) => {
-            let frames = Opened::Unlinked(Box::new(receive_unlinked(stream, input)?));
-            UntrackedInput::with_own_times(frames, None).track(&input.path)?
+            receive_untracked(stream, None, input)?.track(&input.path)?
         }
         Some(stream) => return pack_arriving(stream, input, output, storing, overwrite),
         None => open_input(input)?,

@@ -189,8 +189,13 @@ impl FrameFiles {
     /// listed; error messages name it.
     ///
     /// # Errors
-    /// Fails if the numbers of the frames have a gap or if an entry is not a file, unless `allow_gaps` is true.
+    /// Fails if the names of the frames differ in more than their numbers, or if two have the same number. Unless
+    /// `allow_gaps` is true, also fails if the numbers of the frames have a gap or if an entry is not a file.
     pub(crate) fn checked(self, folder: &Path, allow_gaps: bool) -> Result<Vec<PathBuf>> {
+        if let Some((expected, found)) = misnamed_pair(&self.frames) {
+            return Err(Error::input(folder, "", expected, found)
+                .hint("move the files that are not frames of this sequence into another folder"));
+        }
         if allow_gaps {
             return Ok(self.frames);
         }
@@ -204,6 +209,40 @@ impl FrameFiles {
         }
         Ok(self.frames)
     }
+}
+
+/// Finds two of the files `frames`, sorted in natural order, that cannot be frames of one sequence: their names differ in
+/// the text around their numbers, or have the same numbers. Returns descriptions of the expected names and of the two
+/// found ones; `None` if all names fit, or if no name has a number.
+fn misnamed_pair(frames: &[PathBuf]) -> Option<(&'static str, String)> {
+    // Text around the numbers of a name, in which `0` stands for each number, and the numbers without leading zeros.
+    let parts = |path: &PathBuf| {
+        let name = file_name(path).to_string_lossy().to_ascii_lowercase();
+        let (mut text, mut numbers) = (String::new(), Vec::new());
+        for run in name.as_bytes().chunk_by(|a, b| a.is_ascii_digit() == b.is_ascii_digit()) {
+            let run = String::from_utf8_lossy(run);
+            match run.starts_with(|c: char| c.is_ascii_digit()) {
+                true => {
+                    text.push('0');
+                    numbers.push(run.trim_start_matches('0').to_owned());
+                }
+                false => text.push_str(&run),
+            }
+        }
+        (text, numbers)
+    };
+    let named: Vec<_> = frames.iter().map(parts).collect();
+    if named.iter().all(|(_, numbers)| numbers.is_empty()) {
+        return None;
+    }
+    let pair = |a: usize, b: usize| format!("{} and {}", file_name(&frames[a]).shown(), file_name(&frames[b]).shown());
+    if let Some(other) = named.iter().position(|(text, _)| *text != named[0].0) {
+        return Some(("files whose names differ only in their numbers", pair(0, other)));
+    }
+    let mut by_number: Vec<usize> = (0..named.len()).collect();
+    by_number.sort_by_key(|&at| &named[at].1);
+    let repeated = by_number.windows(2).find(|two| named[two[0]].1 == named[two[1]].1)?;
+    Some(("each frame number once", pair(repeated[0], repeated[1])))
 }
 
 /// Finds the first missing frame of a sequence with the files `frames`, whose names contain frame numbers. Returns
@@ -267,6 +306,31 @@ fn check_properties(ply: &Ply, properties: &[Property], first: &Path) -> Result<
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_that_do_not_fit_one_sequence_are_found() {
+        let found = |names: &[&str]| {
+            let mut paths: Vec<PathBuf> = names.iter().map(PathBuf::from).collect();
+            paths.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
+            misnamed_pair(&paths).map(|(_, pair)| pair)
+        };
+        for fitting in [
+            &["f_9.ply", "f_10.ply", "f_0011.PLY"][..],
+            &["1_cloud_0.ply", "2_cloud_0.ply"],
+            &["left.ply", "right.ply"],
+            &["only.ply"],
+            &[],
+        ] {
+            assert_eq!(found(fitting), None, "{fitting:?}");
+        }
+        for (names, pair) in [
+            (&["f_0.ply", "f_1.ply", "point_cloud.ply"][..], "f_0.ply and point_cloud.ply"),
+            (&["f_0.ply", "f_1.ply", "g_0.ply"], "f_0.ply and g_0.ply"),
+            (&["f_0.ply", "f_01.ply", "f_02.ply", "f_1.ply"], "f_01.ply and f_1.ply"),
+        ] {
+            assert_eq!(found(names).as_deref(), Some(pair));
+        }
+    }
 
     #[test]
     fn padded_and_unpadded_numbers_sort_by_value() {

@@ -218,5 +218,13 @@ mod tests {
         // A model whose deformation file is missing is not a static model.
         fs::write(root.join("cfg_args"), "Namespace(sh_degree=3, defor_depth=1)").unwrap();
         assert!(open(&root, None).err().unwrap().to_string().contains("deformation.pth"));
+        for key in ["deform_type='node'", "is_6dof=False"] {
+            fs::write(root.join("cfg_args"), format!("Namespace(sh_degree=3, {key})")).unwrap();
+            let message = open(&root, None).err().unwrap().to_string();
+            assert!(message.contains("deform, ") || message.contains("deform:"), "{message}");
+            assert!(message.contains("deform.pth") && message.contains("no such folder"), "{message}");
+        }
+        fs::write(root.join("cfg_args"), "Namespace(sh_degree=3, deform_type='static')").unwrap();
+        assert_eq!(open(&root, None).unwrap().kind(), "3D Gaussian Splatting model");
     }
 }

@@ -6,7 +6,8 @@
 //! each) and the memory of [`RunningContribution`].
 //!
 //! The time span and the number of frames are known only at the end of the stream. Until then two assumptions are made:
-//! frames are evenly spaced, and every view has exactly the time of a frame. If an assumption proves wrong, the
+//! frames are evenly spaced, and every view, with its time as a fraction of the last view's, has exactly the time of a
+//! frame. If an assumption proves wrong, the
 //! statistics are computed again from the packed frames in the container; the result is the same in both cases.
 
 use std::cell::OnceCell;
@@ -34,8 +35,8 @@ use crate::progress::Message;
 use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
 use crate::scene::{
-    FrameQuota, InputOptions, OpenedInput, Scene, UntrackedInput, from_input, is_linked, load_cameras, open_stream,
-    open_untracked, receive_unlinked, receiving_estimate,
+    FrameQuota, InputOptions, Scene, from_input, is_linked, load_stream_cameras, open_stream, open_untracked,
+    receive_untracked, receiving_estimate, with_cameras,
 };
 use crate::source::{FrameSource, ReadCounts};
 use crate::statistics::ScanPlan;
@@ -60,8 +61,7 @@ pub fn open_to_measure(
 ) -> Result<(Scene, RunPlan, Option<Measured>)> {
     let mut start = Stopwatch::start();
     let opened = if options.is_stream() {
-        let normalized = cameras::TimeConvention::Normalized;
-        let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalized, None)?;
+        let rig = load_stream_cameras(options)?;
         let stream = open_stream(options)?;
         if !is_linked(stream.header(), options) {
             let (mut scene, stages, measured) = receive_measured(stream, rig, options, plan, journal)?;
@@ -69,7 +69,7 @@ pub fn open_to_measure(
             journal.record_opening("receive", start, scene.source().info().count, ReadCounts::default());
             return Ok((scene, stages, measured));
         }
-        UntrackedInput::with_own_times(Opened::Unlinked(Box::new(receive_unlinked(stream, options)?)), rig)
+        receive_untracked(stream, rig, options)?
     } else {
         open_untracked(options)?
     };
@@ -187,9 +187,9 @@ fn receive_measured(
         measuring.add(held)
     })?;
     let frames_arrived = quota.arrived();
-    let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
-    let opened = OpenedInput { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
-    let mut scene = from_input(opened, options)?;
+    let rig_given = rig.get().filter(|_| has_cameras).cloned();
+    let opened = with_cameras(options, Opened::Model(Box::new(streamed)), rig_given)?;
+    let mut scene = from_input(opened.track(&options.path)?, options)?;
     // The number of frames is known now.
     let (now, counted) = (scene.workload(), Budget { tell: Verbosity::Nothing, ..options.memory });
     if !MemoryPlan::fits_budget(now, counted, |work, limits| stages.estimates(work, limits)) {
@@ -319,7 +319,10 @@ impl<'a> Measuring<'a> {
         if !complete.fits_scan_begun_with(self.plan) {
             return Some("the frames are not evenly spaced in time");
         }
-        (self.schedule != scene.schedule).then_some("the cameras' times are not exactly those of the frames")
+        (self.schedule != scene.schedule).then_some(match self.assumed.rig.views == scene.rig.views {
+            true => "the cameras' times are not exactly those of the frames",
+            false => "the camera file gives the times of the frames themselves, not fractions of the last time",
+        })
     }
 
     fn finish(self, complete: &ScanPlan) -> Measured {

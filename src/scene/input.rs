@@ -146,11 +146,6 @@ pub struct UntrackedInput {
 }
 
 impl UntrackedInput {
-    /// Returns the input `opened` whose frames keep their times, with the cameras `rig`.
-    pub fn with_own_times(opened: Opened, rig: Option<Rig>) -> UntrackedInput {
-        UntrackedInput { opened, rig, times: None, notes: Vec::new() }
-    }
-
     /// Returns the input with the times of its frames. Frames that are not linked yet are linked first, which reads all
     /// of them and renders some. `path` is the input in messages.
     ///
@@ -178,7 +173,7 @@ impl UntrackedInput {
 ///
 /// # Errors
 /// Fails if the file does not exist or contains no cameras.
-pub fn load_cameras(
+pub(super) fn load_cameras(
     options: &InputOptions,
     path: Option<&Path>,
     times: TimesSource,

@@ -16,19 +16,21 @@ mod work;
 use std::path::PathBuf;
 
 use crate::cache::Cache;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Throughput, Workload};
 use crate::model::{Rig, Split, ViewSchedule};
-use crate::models::InputModel;
+use crate::models::{InputModel, TimeOrigin};
 use crate::progress::Events;
 use crate::source::ReadCounts;
 
 use absent::Absent;
 pub use compressed::open_compressed;
-pub use input::{InputOptions, OpenedInput, UntrackedInput, load_cameras};
-pub use open::{first_frame_box, from_input, open_input, open_scene, open_untracked, scratch_beside};
-pub use stream::{FrameQuota, frame_quota, is_linked, open_stream, receive_unlinked, receiving_estimate};
+pub use input::{InputOptions, OpenedInput, UntrackedInput};
+pub use open::{first_frame_box, from_input, open_input, open_scene, open_untracked, scratch_beside, with_cameras};
+pub use stream::{
+    FrameQuota, frame_quota, is_linked, load_stream_cameras, open_stream, receive_untracked, receiving_estimate,
+};
 pub(crate) use work::add_file_stamps;
 pub use work::open_cache;
 
@@ -84,7 +86,12 @@ impl Scene {
     /// # Errors
     /// Fails if a camera has a time that is not the time of any frame.
     pub fn new(path: PathBuf, input: Box<dyn InputModel>, rig: Rig, split: Option<Split>) -> Result<Scene> {
-        let schedule = rig.schedule(&input.source().info().times, split)?;
+        let schedule = rig.schedule(&input.source().info().times, split).map_err(|error| match input.timing() {
+            TimeOrigin::Continuous => {
+                Error::usage(format!("{error}, or set --frames to the number of times in the camera file"))
+            }
+            TimeOrigin::Numbered | TimeOrigin::Stamped => error,
+        })?;
         let background = rig.background.or(input.background()).unwrap_or([0.0; 3]);
         Ok(Scene {
             path,

@@ -40,9 +40,9 @@ pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
         return open_packed_stream(options);
     }
     let path = &options.path;
-    let mut notes = Vec::new();
     let opened = models::open(path, &options.open_options())?;
     let rig = load_input_cameras(options, &opened)?;
+    let UntrackedInput { opened, rig, mut notes, .. } = with_cameras(options, opened, rig)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let times = match opened.timing() {
         TimeOrigin::Continuous => Some(match options.frames {
@@ -71,28 +71,65 @@ pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
     Ok(UntrackedInput { opened, rig, times, notes })
 }
 
-/// Loads the cameras that `options` name, or else the cameras found with the input `opened`. Returns `None` if there
-/// are neither. The times in a camera file may be normalized or on the scale of the frames' time stamps:
-/// - First, they are read in the time convention of the input.
-/// - If the frames of the input have time stamps and the resulting times are not among them, the times as stated in the
-///   file are tried. They are used if they are among the time stamps.
+/// Loads the cameras that `options` name, or else the cameras found with the input `opened`, in the time convention of
+/// the input. Returns `None` if there are neither.
 fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<Rig>> {
-    let (model, timing, frame_times) = (opened.model(), opened.timing(), opened.times());
+    let model = opened.model();
     let path = camera_path(options, model);
-    // Numbers in the image names of a still scene are not times.
-    let is_still = timing != TimeOrigin::Continuous && frame_times.len() == 1;
     let by_name = path.as_deref().is_some_and(cameras::are_timed_by_name);
     let times = match options.times {
-        TimesSource::Own if is_still && by_name => TimesSource::None,
+        // Numbers in the image names of a still scene are not times.
+        TimesSource::Own if has_one_frame(opened) && by_name => TimesSource::None,
         _ => options.times.clone(),
     };
-    let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, model);
-    let rig = load(model.map_or(TimeConvention::Normalized, InputModel::time_convention))?;
-    let fits = |rig: &Rig| rig.schedule(&frame_times, options.split).is_ok();
-    match rig.as_ref().is_some_and(|rig| timing == TimeOrigin::Stamped && !fits(rig)) {
-        true => Ok(load(TimeConvention::Given)?.filter(fits).or(rig)),
-        false => Ok(rig),
-    }
+    let clock = model.map_or(TimeConvention::Normalized, InputModel::time_convention);
+    load_cameras(options, path.as_deref(), times, clock, model)
+}
+
+/// Returns the input `opened`, whose frames keep their times, with its cameras `rig`, if it has any. The cameras must
+/// have been read in the time convention of the input. But the times in a camera file may be on the scale of the frames'
+/// time stamps: if the frames have time stamps, and the times of `rig` are not among them, the times as stated in the
+/// file are tried. They are used if they are among the time stamps.
+///
+/// If the input has only one frame, which none of these times fits, every camera sees this frame, and a note says so.
+///
+/// # Errors
+/// Fails if the camera file can no longer be read.
+pub fn with_cameras(options: &InputOptions, opened: Opened, rig: Option<Rig>) -> Result<UntrackedInput> {
+    let (model, frame_times) = (opened.model(), opened.times());
+    let is_misfit = |rig: &Rig| match opened.timing() {
+        TimeOrigin::Continuous => false,
+        // A single frame takes the only time of its cameras.
+        TimeOrigin::Numbered => frame_times.len() == 1 && rig.times().len() > 1,
+        TimeOrigin::Stamped => rig.schedule(&frame_times, options.split).is_err(),
+    };
+    let mut notes = Vec::new();
+    let rig = match rig {
+        Some(rig) if is_misfit(&rig) => {
+            let (path, times) = (camera_path(options, model), options.times.clone());
+            let given = load_cameras(options, path.as_deref(), times, TimeConvention::Given, model)?;
+            Some(match given.filter(|given| !is_misfit(given)) {
+                Some(given) => given,
+                None if has_one_frame(&opened) => {
+                    let rig = rig.without_times();
+                    let views = rig.views.len();
+                    notes.push(format!(
+                        "one frame: its {views} views are those of {}, whose times are ignored",
+                        rig.origin
+                    ));
+                    rig
+                }
+                None => rig,
+            })
+        }
+        rig => rig,
+    };
+    Ok(UntrackedInput { opened, rig, times: None, notes })
+}
+
+/// Returns whether the input `opened` has only one frame and cannot be evaluated at other times.
+fn has_one_frame(opened: &Opened) -> bool {
+    opened.timing() != TimeOrigin::Continuous && opened.times().len() == 1
 }
 
 /// Returns evenly spaced frame times from 0 up to but not including `span`, for a model whose cameras give no times.

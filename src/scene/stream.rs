@@ -5,6 +5,7 @@ use std::io::{IsTerminal, Stdin};
 use std::path::Path;
 
 use super::input::{InputOptions, UntrackedInput, load_cameras};
+use super::open::with_cameras;
 use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
@@ -42,21 +43,40 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
-/// Opens the stream on standard input together with its cameras. The stream is received completely. Its Gaussians still
-/// have to be linked into tracks (Gaussians followed through frames) if [`is_linked`] says so.
+/// Loads the cameras that `options` name for a stream, before its frames arrive; `None` if `options` name none. Their
+/// times are normalized. [`with_cameras`] corrects them once the times of all frames are known.
+///
+/// # Errors
+/// Fails if the file does not exist or contains no cameras.
+pub fn load_stream_cameras(options: &InputOptions) -> Result<Option<Rig>> {
+    load_cameras(options, options.cameras.as_deref(), options.times.clone(), TimeConvention::Normalized, None)
+}
+
+/// Opens the stream on standard input together with its cameras, as [`receive_untracked`] does.
+///
+/// # Errors
+/// Fails as [`receive_untracked`] does, or if the cameras are invalid.
+pub(super) fn open_packed_stream(options: &InputOptions) -> Result<UntrackedInput> {
+    let rig = load_stream_cameras(options)?;
+    receive_untracked(open_stream(options)?, rig, options)
+}
+
+/// Receives a stream of frames completely. Its Gaussians still have to be linked into tracks (Gaussians followed through
+/// frames) if [`is_linked`] says so. `rig`: cameras from [`load_stream_cameras`].
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
 /// that the container stores together).
-pub(super) fn open_packed_stream(options: &InputOptions) -> Result<UntrackedInput> {
-    let rig =
-        load_cameras(options, options.cameras.as_deref(), options.times.clone(), TimeConvention::Normalized, None)?;
-    let stream = open_stream(options)?;
+pub fn receive_untracked(
+    stream: FrameStream<Stdin>,
+    rig: Option<Rig>,
+    options: &InputOptions,
+) -> Result<UntrackedInput> {
     let opened = match is_linked(stream.header(), options) {
         true => Opened::Unlinked(Box::new(receive_unlinked(stream, options)?)),
         false => Opened::Model(Box::new(pack_stream(stream, options)?)),
     };
-    Ok(UntrackedInput::with_own_times(opened, rig))
+    with_cameras(options, opened, rig)
 }
 
 /// Packs a stream of frames into a temporary container file and opens this file.
@@ -83,7 +103,7 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
 /// that the container stores together).
-pub fn receive_unlinked(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<UnlinkedFrames> {
+fn receive_unlinked(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<UnlinkedFrames> {
     let open = options.open_options();
     match stream.header().is_unlinked {
         true => UnlinkedFrames::receive(stream, Path::new(STANDARD_INPUT), &open),

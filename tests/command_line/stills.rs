@@ -106,6 +106,21 @@ fn attributes_survive_every_format_within_a_step() {
 }
 
 #[test]
+fn still_is_seen_by_every_camera_whatever_its_times() {
+    let workplace = Workplace::new();
+    write_ply(&workplace, "still.ply");
+    workplace.done("convert still.ply still.gseq");
+    for input in ["still.ply", "still.gseq"] {
+        // Ten frames of four training cameras each, which do not move.
+        let summary =
+            workplace.summary(&format!("{input} --cameras {{tiny}} -o small.ply --count 20 --no-refine --overwrite"));
+        assert_eq!((&summary["cameras"]["pairs"], &summary["gaussians"]), (&4.into(), &20.into()), "{input}");
+        assert!(summary["notes"].to_string().contains("whose times are ignored"), "{input}: {}", summary["notes"]);
+        workplace.done(&format!("evaluate {input} small.ply --cameras {{tiny}}"));
+    }
+}
+
+#[test]
 fn frames_of_other_players_are_read_from_a_folder() {
     let workplace = Workplace::new();
     for frame in 0..3 {

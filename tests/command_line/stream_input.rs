@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::scene::{Workplace, files, lasting_files, state};
+use crate::scene::{Workplace, files, lasting_files, state, tiny};
 use gseq::{Reader, TileId};
 use splatsieve::files::container::Container;
 use splatsieve::source::FrameSource;
@@ -123,6 +123,32 @@ fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
     }
     assert_eq!(frame, 10);
     bytes
+}
+
+#[test]
+fn stream_takes_the_cameras_of_its_container() {
+    let workplace = Workplace::new();
+    // The times of the cameras are those of the frames. As fractions of the last one, they would not be.
+    let stream = retimed(&tiny_stream(&workplace), |frame| frame as f64 / 16.0);
+    fs::create_dir(workplace.path("cameras")).unwrap();
+    for name in ["transforms_train.json", "transforms_test.json"] {
+        let mut cameras: serde_json::Value = serde_json::from_slice(&fs::read(tiny().join(name)).unwrap()).unwrap();
+        for image in cameras["frames"].as_array_mut().unwrap() {
+            image["time"] = ((image["time"].as_f64().unwrap() * 9.0).round() / 16.0).into();
+        }
+        fs::write(workplace.path("cameras").join(name), cameras.to_string()).unwrap();
+    }
+    done(workplace.piped("convert - packed.gseq", &stream));
+    for options in ["", " --link always"] {
+        workplace.done(&format!("score packed.gseq --cameras cameras -o expected.npz --overwrite{options}"));
+        done(workplace.piped(&format!("score - --cameras cameras -o found.npz --overwrite{options}"), &stream));
+        assert!(fs::read(workplace.path("expected.npz")).unwrap() == fs::read(workplace.path("found.npz")).unwrap());
+    }
+    let other = retimed(&stream, |frame| frame as f64 / 32.0);
+    let refused = workplace.piped("score - --cameras cameras -o other.npz", &other);
+    let message = String::from_utf8_lossy(&refused.stderr);
+    assert!(refused.status.code() == Some(2) && message.contains("no frame at this time"), "{message}");
+    assert!(!message.contains("--frames"), "{message}");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Cameras of a data set, and the views (a camera at a time) from which the scene was photographed.
 
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -85,6 +86,24 @@ impl Rig {
         let near = 0.5 * TIME_TOLERANCE * span(&times);
         times.dedup_by(|later, kept| *later - *kept <= near);
         times
+    }
+
+    /// Returns this rig for a scene that does not move: no view has a time, so every camera sees every frame. Of several
+    /// views of one camera in one split, the first is kept. If different cameras then have views of the same number,
+    /// the views of each camera get the index of the camera as their number.
+    pub fn without_times(mut self) -> Rig {
+        let mut kept = HashSet::new();
+        self.views.retain(|rig_view| kept.insert((rig_view.camera, rig_view.split)));
+        let mut camera_of = HashMap::new();
+        let is_ambiguous =
+            self.views.iter().any(|found| *camera_of.entry(found.view).or_insert(found.camera) != found.camera);
+        for rig_view in &mut self.views {
+            rig_view.time = None;
+            if is_ambiguous {
+                rig_view.view = rig_view.camera;
+            }
+        }
+        self
     }
 
     /// Returns the split of the views that were held out of training: test, or validation if there are no test views.
@@ -173,7 +192,7 @@ impl Rig {
         };
         Error::usage(format!(
             "{}: view {view} was taken at time {time}, but the sequence has no frame at this time: it {frames}\n  \
-             use the cameras of this scene, or set --frames to the number of times in the camera file",
+             use the cameras of this scene",
             self.origin,
         ))
     }
@@ -247,6 +266,23 @@ mod tests {
     }
 
     #[test]
+    fn rig_without_times_has_one_view_per_camera() {
+        let mut still = rig(&[
+            (0, Some(0.0), Split::Train),
+            (1, Some(0.0), Split::Test),
+            (0, Some(0.5), Split::Train),
+            (1, Some(0.5), Split::Train),
+        ])
+        .without_times();
+        let views = |rig: &Rig| -> Vec<_> { rig.views.iter().map(|v| (v.view, v.camera, v.time, v.split)).collect() };
+        let expected = [(0, 0, None, Split::Train), (1, 1, None, Split::Test), (1, 1, None, Split::Train)];
+        assert_eq!(views(&still), expected);
+        // Cameras of which each has a view of the number 7, as in the file of a moving camera.
+        still.views.iter_mut().for_each(|rig_view| rig_view.view = 7);
+        assert_eq!(views(&still.without_times()), expected);
+    }
+
+    #[test]
     fn timed_and_timeless_views_keep_the_file_order() {
         let rig = rig(&[
             (0, None, Split::Train),
@@ -287,7 +323,7 @@ mod tests {
     fn view_without_a_frame_is_an_error_with_its_details() {
         let rig = rig(&[(0, Some(0.0), Split::Train), (3, Some(0.25), Split::Test)]);
         let message = rig.schedule(&[0.0, 0.5, 1.0], None).unwrap_err().to_string();
-        for part in ["test.json", "view 3", "0.25", "has 3 frames, from time 0 to 1", "--frames"] {
+        for part in ["test.json", "view 3", "0.25", "has 3 frames, from time 0 to 1"] {
             assert!(message.contains(part), "{part:?} is not in {message:?}");
         }
         assert!(rig.schedule(&[0.0, 0.5, 1.0], Some(Split::Train)).is_ok(), "views of other splits must be ignored");

@@ -126,7 +126,7 @@ pub(super) fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
                 listed.len()
             )));
         }
-        let origin = format!("{} (each of {frames} frames)", shown_name(&folder));
+        let origin = format!("{} (each of {frames} frames)", shown_reconstruction(&folder));
         let first_frame = listed.iter().map(listed_image).collect::<Result<Vec<_>>>()?;
         builder.begin_file(&images, listed.len() * frames)?;
         frames::repeat_for_frames(&first_frame, &first, frames).try_for_each(|image| builder.add(image))?;
@@ -138,7 +138,7 @@ pub(super) fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     for (index, image) in listed.iter().enumerate() {
         builder.add(ListedImage { time: given.get(index).copied().flatten(), ..listed_image(image)? })?;
     }
-    let origin = shown_name(&folder);
+    let origin = shown_reconstruction(&folder);
     let origin = if source.is_empty() { origin } else { format!("{origin} ({source})") };
     builder.finish(None, origin)
 }
@@ -151,6 +151,17 @@ fn reconstruction_folder(path: &Path) -> Result<PathBuf> {
     [folder.to_owned(), folder.join("0")].into_iter().find(|folder| holds(folder)).ok_or_else(|| {
         Error::input(folder, "", "a COLMAP reconstruction: cameras.bin and images.bin, or both as .txt", "neither")
     })
+}
+
+/// Returns the name of the reconstruction in `folder` for messages: the last component of its path, or the last two, such
+/// as `sparse/0`, if the last is a number.
+fn shown_reconstruction(folder: &Path) -> String {
+    let name = shown_name(folder);
+    let above = std::path::absolute(folder).ok();
+    match above.as_deref().and_then(Path::parent).filter(|above| above.file_name().is_some()) {
+        Some(above) if name.bytes().all(|byte| byte.is_ascii_digit()) => format!("{}/{name}", shown_name(above)),
+        _ => name,
+    }
 }
 
 /// Returns the folder of the images that belong to the reconstruction in `folder`: the folder `images` beside `sparse`,

@@ -86,6 +86,11 @@ impl<'a> CameraFields<'a> {
         }
     }
 
+    /// Returns whether the value under `key` is `true`.
+    pub(super) fn is_true(&self, key: &str) -> bool {
+        matches!(self.map.get(key), Some(SmallValue::Bool(true)))
+    }
+
     /// Returns the non-negative whole number under `key`, or `None` if the key is missing or null. Fails for other
     /// values, and for numbers that do not fit into 32 bits.
     pub(super) fn optional_index(&self, key: &str) -> Result<Option<u32>> {

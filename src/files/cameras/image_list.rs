@@ -10,7 +10,7 @@ use crate::files::json::{ParseAbort, read};
 
 /// Keys that [`outline`] reads: keys that show in which format the camera file is, and keys whose values hold for all
 /// images of the file.
-const OUTLINE_KEYS: [&str; 14] = [
+const OUTLINE_KEYS: [&str; 25] = [
     "frames",
     "w2c",
     "transform_matrix",
@@ -23,6 +23,17 @@ const OUTLINE_KEYS: [&str; 14] = [
     "cy",
     "camera_angle_x",
     "camera_angle_y",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+    "camera_model",
+    "is_fisheye",
+    "train_filenames",
+    "val_filenames",
+    "test_filenames",
     "background",
     "rotation",
 ];

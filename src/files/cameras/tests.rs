@@ -309,6 +309,49 @@ fn own_cameras_json_is_read_completely() {
 }
 
 #[test]
+fn distortion_of_a_pixel_is_refused_in_transforms() {
+    let with = |entries: &[(&str, Value)]| {
+        let mut file = transforms(&[0.0, 1.0]);
+        entries.iter().for_each(|(key, value)| file[*key] = value.clone());
+        file
+    };
+    let undistorted = load_json("transforms.json", &transforms(&[0.0, 1.0])).unwrap();
+    for entries in [
+        // Moves the corners at (±0.55, ±0.41) by k1 r³ f = 0.8 pixels.
+        &[("k1", json!(0.035)), ("camera_model", json!("OPENCV"))][..],
+        &[("k1", json!(0.0)), ("p2", json!(0)), ("camera_model", json!("PINHOLE")), ("is_fisheye", json!(false))],
+    ] {
+        assert_eq!(load_json("transforms.json", &with(entries)).unwrap().cameras, undistorted.cameras);
+    }
+    for (key, value) in [
+        ("k1", json!(0.05)),
+        ("k4", json!(-3.0)),
+        ("p1", json!(0.1)),
+        ("camera_model", json!("OPENCV_FISHEYE")),
+        ("is_fisheye", json!(true)),
+    ] {
+        let expected = [key, "without distortion", "undistort the images"];
+        assert_refused("transforms.json", &with(&[(key, value.clone())]), &expected);
+        let mut of_one_image = transforms(&[0.0, 1.0]);
+        of_one_image["frames"][1][key] = value;
+        assert_refused("transforms.json", &of_one_image, &[&expected[..], &["frame 1"]].concat());
+    }
+}
+
+#[test]
+fn lists_of_images_in_transforms_state_splits() {
+    let mut file = transforms(&[0.0, 0.25, 0.5, 1.0]);
+    file["train_filenames"] = json!(["train/r_000", "train/r_003"]);
+    file["val_filenames"] = json!(["./train/r_001", "train/r_002"]);
+    file["test_filenames"] = json!(["train/r_002"]);
+    let rig = load_json("transforms.json", &file).unwrap();
+    let splits: Vec<Split> = rig.views.iter().map(|rig_view| rig_view.split).collect();
+    assert_eq!(splits, [Split::Train, Split::Val, Split::Test, Split::Train]);
+    file["test_filenames"] = json!([7]);
+    assert_refused("transforms.json", &file, &["test_filenames", "element 0", "the name of an image", "7"]);
+}
+
+#[test]
 fn cameras_of_a_3dgs_folder_see_every_frame() {
     let entry = |id: u32, x: f64| {
         json!({"id": id, "img_name": format!("{id:05}"), "width": 80, "height": 60, "fx": 70.0, "fy": 71.0,

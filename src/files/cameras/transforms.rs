@@ -3,8 +3,9 @@
 //! Intrinsics are `fl_x fl_y cx cy w h`, or `camera_angle_x` (and `camera_angle_y`), the field of view in radians. They
 //! are keys of the image or, for all images, of the file; a key of the image takes precedence. Pixels are square and
 //! the principal point is the middle of the image unless the file states otherwise. An image has `file_path`,
-//! `transform_matrix` and, if the scene moves, `time`. Lens distortion (`k1` …) is ignored: images are assumed to be
-//! undistorted.
+//! `transform_matrix` and, if the scene moves, `time`. Lens distortion (`k1` …) is refused if it moves a corner of the
+//! image by [`MAX_SHIFT_PX`] or more, and ignored otherwise. Splits are stated by the names of the files, or by lists of
+//! images in a file ([`SPLIT_LISTS`], Nerfstudio).
 //!
 //! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
 //! were trained (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames 0 … T−1 and files
@@ -14,12 +15,13 @@
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
+use hashbrown::HashMap;
 
-use super::assemble::{ListedImage, RigBuilder, from_camera_to_world, view_in_name};
+use super::assemble::{ListedImage, MemoryCounter, RigBuilder, from_camera_to_world, view_in_name};
 use super::fields::CameraFields;
 use super::image_list::{each_image, outline};
 use super::{CameraOptions, TimeConvention};
-use crate::error::{Result, ShowPath};
+use crate::error::{Error, Result, ShowPath};
 use crate::files::image::measure;
 use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
@@ -29,8 +31,43 @@ use crate::model::{Rig, Split};
 const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
 /// Keys that are read from the entry of an image in `transforms*.json`.
-const IMAGE_KEYS: [&str; 11] =
-    ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
+const IMAGE_KEYS: [&str; 19] = [
+    "file_path",
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+    "camera_model",
+    "is_fisheye",
+    "camera_angle_x",
+    "camera_angle_y",
+    "transform_matrix",
+    "time",
+];
+
+/// Lists of image names by which Nerfstudio divides the images of a file into splits. An image in several lists belongs
+/// to the split of the last of them, an image in none to the split of the file.
+const SPLIT_LISTS: [(&str, Split); 3] =
+    [("train_filenames", Split::Train), ("val_filenames", Split::Val), ("test_filenames", Split::Test)];
+
+/// Estimated memory per image name in the lists of splits, without its text, in bytes. When the table grows, it is
+/// copied to a table of twice the size, and both exist for a moment.
+const SPLIT_ENTRY_BYTES: u64 = 3 * 32 + 32;
+
+/// Values of `camera_model` of cameras without distortion, or with the distortion that [`shift_by_lens`] computes.
+const PERSPECTIVE_MODELS: [&str; 5] = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
+
+/// Shift in pixels of a corner of an image by lens distortion, from which the image is refused. A smaller shift does not
+/// change which Gaussians are visible.
+const MAX_SHIFT_PX: f64 = 1.0;
 
 /// Reads the cameras in `file`, the `transforms*.json` of one split (training, validation or test). The files of the
 /// other splits may lie beside it. If `with_others` is true (the user named the folder), their cameras are read, too.
@@ -97,25 +134,50 @@ fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> R
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
     builder.begin_file(file, shared.list_len("frames")?)?;
-    let split = split_of(file);
+    let splits = listed_splits(file, &outline, builder.memory_counter())?;
     each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
-        builder.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
+        builder.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, &splits, options)?)
     })
 }
 
-/// Builds an image of the split `split` from its own keys `image_fields` and the keys `shared` by all images of the
-/// file.
+/// Reads the lists of splits ([`SPLIT_LISTS`]) in `file`. Returns the split of each image that they name. `outline` is
+/// the file without its images; `counter` limits the memory.
+fn listed_splits(file: &Path, outline: &SmallValue, counter: &mut MemoryCounter) -> Result<HashMap<String, Split>> {
+    let mut splits = HashMap::new();
+    for (key, split) in SPLIT_LISTS.into_iter().filter(|(key, _)| outline.get(key).is_some()) {
+        each_image(file, Some(key), &[], |index, name| {
+            let place = format!("key \"{key}\", element {index}");
+            let SmallValue::Text(name) = name else {
+                return Err(Error::input(file, place, "the name of an image", name.describe()));
+            };
+            counter.take(file, &place, "the lists of splits", name.len() as u64 + SPLIT_ENTRY_BYTES)?;
+            splits.insert(relative(name).to_owned(), split);
+            Ok(())
+        })?;
+    }
+    Ok(splits)
+}
+
+/// Returns the image name `name` without a leading `./`.
+fn relative(name: &str) -> &str {
+    name.strip_prefix("./").unwrap_or(name)
+}
+
+/// Builds an image from its own keys `image_fields` and the keys `shared` by all images of the file. `splits` are the
+/// splits that lists in the file state. Fails if the camera is invalid or has distortion.
 fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,
     image_fields: CameraFields<'_>,
-    split: Split,
+    splits: &HashMap<String, Split>,
     options: &CameraOptions,
 ) -> Result<ListedImage> {
     let name = image_fields.optional_text("file_path")?;
     let image = name.map(|name| resolve(file, name));
     let size = size(shared, image_fields, image.as_deref(), options)?;
     let intrinsics = intrinsics(shared, image_fields, size)?;
+    check_lens(shared, image_fields, size, intrinsics)?;
+    let split = name.and_then(|name| splits.get(relative(name))).copied().unwrap_or_else(|| split_of(file));
     let (rotation, center) = image_fields.pose("transform_matrix")?;
     Ok(ListedImage {
         camera: from_camera_to_world(size, intrinsics, rotation * OPENGL_TO_OPENCV, center),
@@ -181,11 +243,68 @@ fn intrinsics(
     Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
 }
 
+/// Checks that the camera of an image is a pinhole camera, whose distortion moves no corner of the image by
+/// [`MAX_SHIFT_PX`] or more. `size` is the image size, and `intrinsics` are fx, fy, cx, cy, all in pixels. The keys
+/// `image_fields` of the image take precedence over the keys `shared` by all images. Fails for other cameras.
+fn check_lens(
+    shared: CameraFields<'_>,
+    image_fields: CameraFields<'_>,
+    (width, height): (u32, u32),
+    [fx, fy, cx, cy]: [f64; 4],
+) -> Result<()> {
+    const EXPECTED: &str = "a camera without distortion (SIMPLE_PINHOLE or PINHOLE)";
+    const ADVICE: &str = "undistort the images, and export their cameras again";
+    for fields in [image_fields, shared] {
+        if let Some(model) = fields.optional_text("camera_model")? {
+            if !PERSPECTIVE_MODELS.contains(&model) {
+                return Err(fields.wrong("camera_model", EXPECTED).hint(ADVICE));
+            }
+            break;
+        }
+    }
+    if let Some(fields) = [image_fields, shared].iter().find(|fields| fields.is_true("is_fisheye")) {
+        return Err(fields.wrong("is_fisheye", EXPECTED).hint(ADVICE));
+    }
+    let mut coefficients = [0.0; 6];
+    let mut stated = None;
+    for (key, value) in ["k1", "k2", "k3", "k4", "p1", "p2"].into_iter().zip(&mut coefficients) {
+        for fields in [image_fields, shared] {
+            if let Some(found) = fields.optional_number(key)? {
+                *value = found;
+                stated = stated.or((found != 0.0).then_some((fields, key)));
+                break;
+            }
+        }
+    }
+    let Some((fields, key)) = stated else { return Ok(()) };
+    let corners = [(0, 0), (width, 0), (0, height), (width, height)];
+    let shifts = corners.map(|(x, y)| {
+        let [dx, dy] = shift_by_lens([(f64::from(x) - cx) / fx, (f64::from(y) - cy) / fy], coefficients);
+        (dx * fx).hypot(dy * fy)
+    });
+    // Test `all` shifts rather than their maximum, because a maximum would ignore NaN.
+    if shifts.iter().all(|shift| *shift < MAX_SHIFT_PX) {
+        return Ok(());
+    }
+    let largest = shifts.into_iter().fold(0.0, f64::max);
+    Err(fields.wrong(key, EXPECTED).hint(format!(
+        "it moves a corner of the image by {largest:.1} pixels: {ADVICE} (or remove k1 to p2 if they are undistorted)"
+    )))
+}
+
+/// Returns the shift of the point (x, y) of the image plane at depth 1 by the lens distortion k1, k2, k3, k4, p1, p2 of
+/// OpenCV: radial, by the factor k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸, and tangential.
+fn shift_by_lens([x, y]: [f64; 2], [k1, k2, k3, k4, p1, p2]: [f64; 6]) -> [f64; 2] {
+    let r2 = x * x + y * y;
+    let radial = r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
+    [x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)]
+}
+
 /// Returns the path of the image that `file` calls `name`, which is relative to the folder of `file`. If `name` has no
 /// image extension, as in D-NeRF, returns the first of `name`, `name.png`, `name.jpg` and `name.jpeg` that exists, or
 /// `name.png` if none exists.
 fn resolve(file: &Path, name: &str) -> PathBuf {
-    let named = file.parent().unwrap_or(Path::new("")).join(name.strip_prefix("./").unwrap_or(name));
+    let named = file.parent().unwrap_or(Path::new("")).join(relative(name));
     let with = |extension: &str| {
         let mut path = named.clone().into_os_string();
         path.push(extension);

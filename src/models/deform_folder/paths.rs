@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::files::digest::digest_of_files;
 use crate::files::state_dict::{is_pair, names, read_state_dict_with_note};
 use crate::limits::ReadLimit;
+use crate::models::four_d_gaussians::cfg_args::read;
 use crate::models::iterations::iteration_numbers;
 
 /// Name of the subfolder that holds the point cloud files.
@@ -33,6 +34,15 @@ pub(in crate::models) fn has_network(root: &Path) -> bool {
     iterations(&root.join(NETWORK_FOLDER), NETWORK_FILE).is_ok_and(|found| !found.is_empty())
 }
 
+/// Returns whether the folder `root` is a model folder whose network is missing: `cfg_args` has a key that only trainers
+/// of such networks write.
+pub(in crate::models) fn lacks_network(root: &Path) -> bool {
+    let arguments = read(&root.join("cfg_args")).unwrap_or_default();
+    let names_network = ["deform_type=", "is_6dof="].iter().any(|key| arguments.contains(key));
+    let is_still = arguments.contains("deform_type='static'");
+    root.join(POINT_CLOUD_FOLDER).is_dir() && names_network && !is_still && !has_network(root)
+}
+
 /// Returns the names of the tensors in the network of the largest iteration; empty if the file cannot be read. Opening
 /// the model then reports the error.
 pub(in crate::models) fn network_tensor_names(root: &Path, memory: ReadLimit) -> Vec<String> {
@@ -56,6 +66,11 @@ impl Paths {
     /// Fails if a folder or file is missing.
     pub(super) fn locate(root: &Path, iteration: Option<u32>) -> Result<Paths> {
         let (clouds, networks) = (root.join(POINT_CLOUD_FOLDER), root.join(NETWORK_FOLDER));
+        if !networks.is_dir() {
+            let expected = format!("this folder of the model, with iteration_K/{NETWORK_FILE}");
+            return Err(Error::input(&networks, "", expected, "no such folder")
+                .hint("training writes it: copy it from where the model was trained"));
+        }
         let (of_cloud, of_network) = (iterations(&clouds, "point_cloud.ply")?, iterations(&networks, NETWORK_FILE)?);
         let both: Vec<u32> = of_cloud.iter().copied().filter(|k| of_network.contains(k)).collect();
         let chosen = iteration.map_or(both.last().copied(), |k| both.contains(&k).then_some(k));

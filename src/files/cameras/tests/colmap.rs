@@ -61,6 +61,7 @@ fn colmap_text_and_binary_give_the_same_rig() {
         rig
     });
     assert_eq!(text.cameras, binary.cameras);
+    assert!(text.origin.starts_with("sparse/0 (times from"), "{}", text.origin);
     let [times, splits] = [&text, &binary]
         .map(|rig| rig.views.iter().map(|rig_view| (rig_view.time, rig_view.split)).collect::<Vec<_>>());
     assert_eq!(times, splits);
