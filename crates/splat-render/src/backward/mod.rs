@@ -101,8 +101,8 @@ impl Renderer {
     /// for the gradients of colors.
     ///
     /// First computes the sums of each splat over each tile; a parallel renderer divides this work by parts of rows of
-    /// tiles.
-    /// Then adds the sums of the tiles of each splat in a fixed order; a parallel renderer divides this work by splats.
+    /// tiles. Then adds the sums of the tiles of each splat in a fixed order; a parallel renderer divides this work by
+    /// splats.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
         let task_count = self.task_count();
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
