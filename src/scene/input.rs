@@ -10,7 +10,7 @@ use crate::files::cameras::{CameraOptions, TimeConvention, TimesSource};
 use crate::memory_plan::Budget;
 use crate::model::{Rig, Split};
 use crate::models;
-use crate::models::{InputModel, LinkMode, OpenOptions, Opened, TrainingConventions};
+use crate::models::{InputModel, LinkMode, OpenOptions, Opened, TimeOrigin, TrainingConventions};
 use crate::progress::Events;
 
 /// Options for opening an input (a model, a sequence of frames or a frame stream) together with its cameras.
@@ -189,4 +189,56 @@ pub(super) fn load_cameras(
     let has_frame_states = input.is_none_or(InputModel::has_explicit_frames);
     let trained_background = || has_frame_states.then(|| models::trained_background(path)).flatten();
     Ok(Some(Rig { background: rig.background.or_else(trained_background), ..rig }))
+}
+
+/// Returns the path of the cameras: the one that `options` name, else that of the training cameras of `model`. Returns
+/// `None` if there is neither.
+pub(super) fn camera_path(options: &InputOptions, model: Option<&dyn InputModel>) -> Option<PathBuf> {
+    options.cameras.clone().or_else(|| cameras::find_training_cameras(model?.data_folder()?, &options.path))
+}
+
+/// Returns the input `opened`, whose frames keep their times, with its cameras `rig`, if it has any. The cameras must
+/// have been read in the time convention of the input. But the times in a camera file may be on the scale of the frames'
+/// time stamps: if the frames have time stamps, and the times of `rig` are not among them, the times as stated in the
+/// file are tried. They are used if they are among the time stamps.
+///
+/// If the input has only one frame, which none of these times fits, every camera sees this frame, and a note says so.
+///
+/// # Errors
+/// Fails if the camera file can no longer be read.
+pub fn with_cameras(options: &InputOptions, opened: Opened, rig: Option<Rig>) -> Result<UntrackedInput> {
+    let (model, frame_times) = (opened.model(), opened.times());
+    let is_misfit = |rig: &Rig| match opened.timing() {
+        TimeOrigin::Continuous => false,
+        // A single frame takes the only time of its cameras.
+        TimeOrigin::Numbered => frame_times.len() == 1 && rig.times().len() > 1,
+        TimeOrigin::Stamped => rig.schedule(&frame_times, options.split).is_err(),
+    };
+    let mut notes = Vec::new();
+    let rig = match rig {
+        Some(rig) if is_misfit(&rig) => {
+            let (path, times) = (camera_path(options, model), options.times.clone());
+            let given = load_cameras(options, path.as_deref(), times, TimeConvention::Given, model)?;
+            Some(match given.filter(|given| !is_misfit(given)) {
+                Some(given) => given,
+                None if has_one_frame(&opened) => {
+                    let rig = rig.without_times();
+                    let views = rig.views.len();
+                    notes.push(format!(
+                        "one frame: its {views} views are those of {}, whose times are ignored",
+                        rig.origin
+                    ));
+                    rig
+                }
+                None => rig,
+            })
+        }
+        rig => rig,
+    };
+    Ok(UntrackedInput { opened, rig, times: None, notes })
+}
+
+/// Returns whether the input `opened` has only one frame and cannot be evaluated at other times.
+pub(super) fn has_one_frame(opened: &Opened) -> bool {
+    opened.timing() != TimeOrigin::Continuous && opened.times().len() == 1
 }

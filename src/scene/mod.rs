@@ -26,8 +26,8 @@ use crate::source::ReadCounts;
 
 use absent::Absent;
 pub use compressed::open_compressed;
-pub use input::{InputOptions, OpenedInput, UntrackedInput};
-pub use open::{first_frame_box, from_input, open_input, open_scene, open_untracked, scratch_beside, with_cameras};
+pub use input::{InputOptions, OpenedInput, UntrackedInput, with_cameras};
+pub use open::{first_frame_box, from_input, open_input, open_scene, open_untracked, scratch_beside};
 pub use stream::{
     FrameQuota, frame_quota, is_linked, load_stream_cameras, open_stream, receive_untracked, receiving_estimate,
 };

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use super::Scene;
-use super::input::{InputOptions, OpenedInput, UntrackedInput, load_cameras};
+use super::input::{InputOptions, OpenedInput, UntrackedInput, camera_path, has_one_frame, load_cameras, with_cameras};
 use super::stream::open_packed_stream;
 use super::view_selection::no_view_error;
 use crate::error::{Error, Result, ShowPath};
@@ -86,52 +86,6 @@ fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<
     load_cameras(options, path.as_deref(), times, clock, model)
 }
 
-/// Returns the input `opened`, whose frames keep their times, with its cameras `rig`, if it has any. The cameras must
-/// have been read in the time convention of the input. But the times in a camera file may be on the scale of the frames'
-/// time stamps: if the frames have time stamps, and the times of `rig` are not among them, the times as stated in the
-/// file are tried. They are used if they are among the time stamps.
-///
-/// If the input has only one frame, which none of these times fits, every camera sees this frame, and a note says so.
-///
-/// # Errors
-/// Fails if the camera file can no longer be read.
-pub fn with_cameras(options: &InputOptions, opened: Opened, rig: Option<Rig>) -> Result<UntrackedInput> {
-    let (model, frame_times) = (opened.model(), opened.times());
-    let is_misfit = |rig: &Rig| match opened.timing() {
-        TimeOrigin::Continuous => false,
-        // A single frame takes the only time of its cameras.
-        TimeOrigin::Numbered => frame_times.len() == 1 && rig.times().len() > 1,
-        TimeOrigin::Stamped => rig.schedule(&frame_times, options.split).is_err(),
-    };
-    let mut notes = Vec::new();
-    let rig = match rig {
-        Some(rig) if is_misfit(&rig) => {
-            let (path, times) = (camera_path(options, model), options.times.clone());
-            let given = load_cameras(options, path.as_deref(), times, TimeConvention::Given, model)?;
-            Some(match given.filter(|given| !is_misfit(given)) {
-                Some(given) => given,
-                None if has_one_frame(&opened) => {
-                    let rig = rig.without_times();
-                    let views = rig.views.len();
-                    notes.push(format!(
-                        "one frame: its {views} views are those of {}, whose times are ignored",
-                        rig.origin
-                    ));
-                    rig
-                }
-                None => rig,
-            })
-        }
-        rig => rig,
-    };
-    Ok(UntrackedInput { opened, rig, times: None, notes })
-}
-
-/// Returns whether the input `opened` has only one frame and cannot be evaluated at other times.
-fn has_one_frame(opened: &Opened) -> bool {
-    opened.timing() != TimeOrigin::Continuous && opened.times().len() == 1
-}
-
 /// Returns evenly spaced frame times from 0 up to but not including `span`, for a model whose cameras give no times.
 /// `requested` is the number of frames that the user asked for. If it is `None`, uses [`DEFAULT_FRAMES`] and adds a
 /// message about this to `notes`.
@@ -192,9 +146,14 @@ pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> 
         None => {
             let rig = if is_still { surrounding_rig(input.source())? } else { virtual_rig(input.source())? };
             let origin = &rig.origin;
+            let (path, folder) = (&options.path, options.path.shown());
+            let unused = match path.is_dir() && cameras::are_in(path) {
+                true => format!("; the input folder holds cameras: --cameras {folder} uses them"),
+                false => String::new(),
+            };
             notes.push(match is_still {
-                true => format!("no cameras were given or found: {origin}"),
-                false => format!("{NO_CAMERAS} ({origin})"),
+                true => format!("no cameras were given or found: {origin}{unused}"),
+                false => format!("{NO_CAMERAS} ({origin}){unused}"),
             });
             if !is_still {
                 options.events.send(Message::Warning(NO_CAMERAS));
@@ -220,10 +179,6 @@ const NO_CAMERAS: &str = "no cameras were given or found. Gaussians are ranked a
 const DEFAULT_FRAMES: usize = 60;
 /// Maximum number of frames at which a model is evaluated. Each takes 8 bytes of memory before any work starts.
 const MAX_FRAMES: usize = 1_000_000;
-
-fn camera_path(options: &InputOptions, model: Option<&dyn InputModel>) -> Option<PathBuf> {
-    options.cameras.clone().or_else(|| cameras::find_training_cameras(model?.data_folder()?, &options.path))
-}
 
 /// Returns a rig of virtual cameras (placed by the program) all around the surface of a scene with only one frame.
 /// Memory: 64 bytes per Gaussian.

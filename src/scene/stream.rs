@@ -4,8 +4,7 @@
 use std::io::{IsTerminal, Stdin};
 use std::path::Path;
 
-use super::input::{InputOptions, UntrackedInput, load_cameras};
-use super::open::with_cameras;
+use super::input::{InputOptions, UntrackedInput, load_cameras, with_cameras};
 use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
 use crate::files::frame_stream::{FrameStream, StreamHeader};

@@ -397,6 +397,12 @@ fn still_takes_any_cameras_or_a_virtual_rig() {
     let stages = |summary: &serde_json::Value| summary["stages"].to_string();
     assert!(stages(&given).contains("visible") && stages(&summary("")).contains("visible"), "{}", stages(&given));
     assert!(summary("")["notes"].to_string().contains("24 cameras"), "{}", summary("")["notes"]);
+    // Cameras in the folder of the input are named, but not used.
+    fs::create_dir(workplace.path("folder")).unwrap();
+    fs::rename(workplace.path("still.ply"), workplace.path("folder/still.ply")).unwrap();
+    fs::rename(workplace.path("orbit.json"), workplace.path("folder/cameras.json")).unwrap();
+    let said = workplace.done("compress folder -o few.ply --ratio 0.5 --no-refine --json");
+    assert!(said.contains("24 cameras") && said.contains("--cameras folder"), "{said}");
 }
 
 #[test]

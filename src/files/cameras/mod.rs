@@ -159,6 +159,11 @@ pub fn find_training_cameras(source_path: &str, model_folder: &Path) -> Option<P
     std::iter::once(PathBuf::from(source_path)).chain(beside).find(|path| locate(path).is_some())
 }
 
+/// Returns whether there is a camera file in the folder `path`.
+pub fn are_in(path: &Path) -> bool {
+    locate(path).is_some()
+}
+
 /// Returns whether the data set at `path` takes the times of its images from their file names, as COLMAP data sets do.
 pub fn are_timed_by_name(path: &Path) -> bool {
     locate(path).is_some_and(|file| is_colmap(&file))
