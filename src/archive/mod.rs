@@ -294,7 +294,7 @@ fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
     if content.columns.len() != steps.columns.len() {
         return Err(Error::internal("the columns of an archive have no quantization steps"));
     }
-    for Column { name, values } in &content.columns {
+    for Column { name, values, .. } in &content.columns {
         if values.len() != content.cloud.len() {
             return Err(Error::internal(format!("{} values of {name} for {}", values.len(), content.cloud.len())));
         }
