@@ -400,14 +400,19 @@ fn write_dynamic_3d_gaussians(model: &Path) {
         array.extend(values).unwrap();
         array.finish().unwrap();
     }
+    write_cameras(model, frames);
+}
+
+/// Writes `transforms_train.json` with one camera of 64 × 64 pixels for each of `frames` frames to `folder`.
+fn write_cameras(folder: &Path, frames: usize) {
     let matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]];
     let camera = |frame: usize| {
-        let time = frame as f64 / (frames - 1) as f64;
+        let time = frame as f64 / (frames - 1).max(1) as f64;
         serde_json::json!({ "file_path": format!("./train/f{frame:03}"), "time": time, "transform_matrix": matrix })
     };
     let cameras: Vec<_> = (0..frames).map(camera).collect();
     let rig = serde_json::json!({ "camera_angle_x": 0.7, "w": 64, "h": 64, "frames": cameras });
-    fs::write(model.join("transforms_train.json"), rig.to_string()).unwrap();
+    fs::write(folder.join("transforms_train.json"), rig.to_string()).unwrap();
 }
 
 #[test]
@@ -422,4 +427,33 @@ fn first_stored_frame_is_as_good_as_the_later_ones() {
     let by_frame: Vec<f64> = frames.iter().map(|frame| frame["psnr"].as_f64().unwrap()).collect();
     let mean = found["psnr"].as_f64().unwrap();
     assert!(by_frame.len() == STORED_FRAMES[0] && by_frame[0] > mean - 3.0, "{by_frame:?}");
+}
+
+/// Writes `NAME.ply` with 900 Gaussians on a grid, the first of them moved to (`far`, 0, 0), and a camera.
+fn write_ply_with_far_gaussian(workplace: &Workplace, name: &str, far: f32) {
+    let mut gaussians = Gaussians::zeros(900, 0);
+    let place = |i: usize| [0.06 * (i % 30) as f32 - 0.9, 0.06 * (i / 30) as f32 - 0.9, 0.1 * (i % 7) as f32];
+    (0..900).for_each(|i| gaussians.position.set_row(i, place(i)));
+    gaussians.position.set_row(0, [far, 0.0, 0.0]);
+    gaussians.rotation.plane_mut(0).fill(1.0);
+    gaussians.log_scale.planes_mut().fill(-3.5);
+    gaussians.opacity_logit.planes_mut().fill(2.0);
+    gaussians.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k % 11) as f32 / 5.0 - 1.0);
+    workplace.ply(&format!("{name}.ply"), &gaussians);
+    write_cameras(&workplace.path(""), 1);
+}
+
+#[test]
+fn a_missed_quality_names_the_far_gaussian() {
+    let workplace = Workplace::new();
+    write_ply_with_far_gaussian(&workplace, "far", 3e4);
+    let run = workplace.run("convert far.ply far.gsz --cameras transforms_train.json");
+    let says = ["misses its quality: expected 50.0 dB", "Gaussian 0 at (30000, 0, 0)", "compress --drop-ids"];
+    assert!(run.code == 0 && says.iter().all(|part| run.stderr.contains(part)), "{}", run.stderr);
+    write_ply_with_far_gaussian(&workplace, "farther", 1e7);
+    let convert = "convert farther.ply farther.gsz --cameras transforms_train.json";
+    workplace.refused(2, convert, &["farther.ply: ", "expected 50.0 dB PSNR", "Gaussian 0 at (10000000, 0, 0)"]);
+    let compress = "compress farther.ply -o farther.gsz --cameras transforms_train.json --archive-psnr 45 --ratio 1 \
+                    --no-refine --prune-only";
+    workplace.refused(2, compress, &["expected the requested 45.0 dB PSNR"]);
 }
