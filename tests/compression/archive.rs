@@ -457,3 +457,11 @@ fn a_missed_quality_names_the_far_gaussian() {
                     --no-refine --prune-only";
     workplace.refused(2, compress, &["expected the requested 45.0 dB PSNR"]);
 }
+
+#[test]
+fn a_4dgs_error_names_the_output_and_the_far_gaussian() {
+    let workplace = Workplace::new();
+    write_ply_with_far_gaussian(&workplace, "farther", 1e7);
+    let parts = ["/farther.4dgs: a .4dgs file cannot", "Gaussian 0 at (10000000, 0, 0)", "compress --drop-ids"];
+    workplace.refused(2, "convert farther.ply farther.4dgs", &parts);
+}
