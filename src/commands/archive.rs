@@ -17,6 +17,7 @@ use crate::journal::Journal;
 use crate::limits::ReadLimit;
 use crate::model::Attributes;
 use crate::models::archive::{holds_model_folder, read_archive, restored_output_kind, unpack};
+use crate::models::size::bytes_below;
 use crate::outputs::kind::{OutputKind, check_folder_name};
 use crate::pipeline::stage::PreparedArchive;
 use crate::pipeline::stages::archive::ArchiveStage;
@@ -65,12 +66,12 @@ pub fn unpack_archive(
     let columns = content.columns.iter().map(|column| column.values.planes().len());
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).chain(columns).sum();
     let attributes = content.cloud.len() * Attributes::all().width(content.cloud.sh_degree());
-    let converted = |kind| ConvertReport {
+    let converted = |kind, bytes| ConvertReport {
         path: output.to_owned(),
         kind,
         gaussians: content.cloud.len(),
         frames: None,
-        bytes: 4 * (values + attributes) as u64,
+        bytes,
         larger: None,
         notes: vec![format!(
             "{} bytes of values from an archive of {} bytes",
@@ -83,18 +84,20 @@ pub fn unpack_archive(
         check_target(output, TargetKind::File, &[path], overwrite)?;
         let staged = StagedFile::new(output, overwrite)?;
         unpack(&content, path, staged.path())?;
+        let bytes = bytes_below(staged.path())?;
         staged.commit()?;
-        return Ok(Some(converted(with_layout.unwrap_or(OutputKind::Ply))));
+        return Ok(Some(converted(with_layout.unwrap_or(OutputKind::Ply), bytes)));
     }
     check_folder_name(output, "convert")?;
     check_target(output, TargetKind::Folder, &[path], overwrite)?;
     let staged = StagedFolder::new(output, overwrite)?;
     unpack(&content, path, staged.path())?;
+    let bytes = bytes_below(staged.path())?;
     let marker = staged.path().join(SUMMARY_FILE);
     let text = serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } });
     fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
     staged.commit()?;
-    Ok(Some(converted(OutputKind::Model)))
+    Ok(Some(converted(OutputKind::Model, bytes)))
 }
 
 /// Writes all Gaussians of `input` to the archive `output`. The quantization steps are chosen so that renders of the

@@ -465,3 +465,16 @@ fn a_4dgs_error_names_the_output_and_the_far_gaussian() {
     let parts = ["/farther.4dgs: a .4dgs file cannot", "Gaussian 0 at (10000000, 0, 0)", "compress --drop-ids"];
     workplace.refused(2, "convert farther.ply farther.4dgs", &parts);
 }
+
+#[test]
+fn unpacking_reports_the_bytes_of_the_files() {
+    let workplace = Workplace::new();
+    write_ply_with_far_gaussian(&workplace, "near", 0.0);
+    workplace.done("convert near.ply near.gsz --cameras transforms_train.json");
+    let report: serde_json::Value = serde_json::from_str(&workplace.done("convert near.gsz back.ply --json")).unwrap();
+    assert_eq!(report["bytes"], fs::metadata(workplace.path("back.ply")).unwrap().len());
+    workplace.done(&format!("compress {TINY} -o small.gsz"));
+    let report: serde_json::Value = serde_json::from_str(&workplace.done("convert small.gsz small --json")).unwrap();
+    let written = lasting_files(&workplace.path("small")).values().map(Vec::len).sum::<usize>();
+    assert_eq!(report["bytes"], written);
+}
