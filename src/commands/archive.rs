@@ -9,7 +9,7 @@ use crate::TOOL;
 use crate::archive::MAGIC;
 use crate::commands::convert_report::ConvertReport;
 use crate::compressed_model::CompressedModel;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::files::names::name_of;
 use crate::files::open::open_file;
@@ -43,12 +43,14 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 /// Restores the model in the archive at `path` in its original form, a model folder or a single file, and writes it to
 /// `output`. Returns `None` and writes nothing if `kind`, the requested format, is not the original format:
 /// - If the archive states the file layout of its model format, this layout determines the original format.
-/// - Otherwise the archive holds a model folder or a PLY file. It is restored if `kind` is either of the two.
+/// - Otherwise the archive holds a model folder or a PLY file. A folder is restored if `kind` is either of the two, a
+///   PLY file if `kind` is this format.
 ///
 /// After `None`, the caller opens the archive as an input and converts it.
 ///
 /// # Errors
-/// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.
+/// Fails if the archive is damaged or needs more than `memory`, if it holds a PLY file and `kind` is a model folder, or if
+/// the output exists already or cannot be written.
 pub fn unpack_archive(
     path: &Path,
     (output, kind): (&Path, OutputKind),
@@ -81,6 +83,13 @@ pub fn unpack_archive(
     };
     let single = with_layout.map_or(!holds_model_folder(&content), |own| own != OutputKind::Model);
     if single {
+        if with_layout.is_none() && kind == OutputKind::Model {
+            return Err(Error::usage(format!(
+                "{}: the archive {} holds one PLY and no model folder\n  give a name that ends in .ply",
+                output.shown(),
+                path.shown()
+            )));
+        }
         check_target(output, TargetKind::File, &[path], overwrite)?;
         let staged = StagedFile::new(output, overwrite)?;
         unpack(&content, path, staged.path())?;

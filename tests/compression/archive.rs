@@ -471,6 +471,7 @@ fn unpacking_reports_the_bytes_of_the_files() {
     let workplace = Workplace::new();
     write_ply_with_far_gaussian(&workplace, "near", 0.0);
     workplace.done("convert near.ply near.gsz --cameras transforms_train.json");
+    workplace.refused(2, "convert near.gsz back", &["back: the archive near.gsz holds one PLY", ".ply"]);
     let report: serde_json::Value = serde_json::from_str(&workplace.done("convert near.gsz back.ply --json")).unwrap();
     assert_eq!(report["bytes"], fs::metadata(workplace.path("back.ply")).unwrap().len());
     workplace.done(&format!("compress {TINY} -o small.gsz"));
