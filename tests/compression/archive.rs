@@ -470,7 +470,11 @@ fn a_4dgs_error_names_the_output_and_the_far_gaussian() {
 fn unpacking_reports_the_bytes_of_the_files() {
     let workplace = Workplace::new();
     write_ply_with_far_gaussian(&workplace, "near", 0.0);
+    let info = |name: &str| -> serde_json::Value {
+        serde_json::from_str(&workplace.done(&format!("info {name} --json"))).unwrap()
+    };
     workplace.done("convert near.ply near.gsz --cameras transforms_train.json");
+    assert_eq!(info("near.gsz")["size"]["field"], 0, "{}", info("near.gsz"));
     workplace.refused(2, "convert near.gsz back", &["back: the archive near.gsz holds one PLY", ".ply"]);
     let report: serde_json::Value = serde_json::from_str(&workplace.done("convert near.gsz back.ply --json")).unwrap();
     assert_eq!(report["bytes"], fs::metadata(workplace.path("back.ply")).unwrap().len());
