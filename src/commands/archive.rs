@@ -49,8 +49,8 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 /// After `None`, the caller opens the archive as an input and converts it.
 ///
 /// # Errors
-/// Fails if the archive is damaged or needs more than `memory`, if it holds a PLY file and `kind` is a model folder, or if
-/// the output exists already or cannot be written.
+/// Fails if the archive is damaged or needs more than `memory`, if it holds a PLY file and `kind` is a model folder, or
+/// if the output exists already or cannot be written.
 pub fn unpack_archive(
     path: &Path,
     (output, kind): (&Path, OutputKind),

@@ -215,8 +215,8 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
 
 /// Checks that the PSNR of an archive against the result before quantization, `summary.psnr`, is not far below the
 /// PSNR that `quality_target` requires. Returns a note for the user if the archive misses its target by more than
-/// [`NOTED_SHORTFALL`]. `requested`: the PSNR that the user gave for it (`--archive-psnr`). An archive with a byte limit
-/// and a refined archive always pass.
+/// [`NOTED_SHORTFALL`]. `requested`: the PSNR that the user gave for it (`--archive-psnr`). An archive with a byte
+/// limit and a refined archive always pass.
 ///
 /// # Errors
 /// Fails if the PSNR is more than [`MAX_SHORTFALL`] below the smaller of the required PSNR and [`ENOUGH_PSNR`]. Then
