@@ -225,7 +225,7 @@ impl CodingErrors {
 
 /// Names the Gaussians that are far from all others: further from the median position than [`FAR_IN_SCENE_SIZES`] times
 /// the median distance. `positions` has one row per Gaussian, or several; `id` returns the index of the Gaussian of a
-/// row. Returns for example "Gaussian 7 at (90000, 0.2, 1)", with at most three Gaussians; `None` if no Gaussian is far.
+/// row. Returns for example "Gaussian 7 at (90000, 0.2, 1)", with at most three Gaussians; `None` if none is far.
 pub fn far_gaussians(positions: &AttributeValues, id: impl Fn(usize) -> usize) -> Option<String> {
     let CodingErrors { middle, scene, .. } = CodingErrors::new(positions);
     let far_distance = FAR_IN_SCENE_SIZES * scene;
