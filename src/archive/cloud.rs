@@ -51,6 +51,10 @@ pub struct Column {
     pub name: String,
     /// Values of the column, one row per Gaussian.
     pub values: AttributeValues,
+    /// Index in [`ATTRIBUTES`] of the attribute whose later frames this column holds, if the Gaussians hold its first
+    /// frame. The attribute then has the quantization step of the column. Not stored in an archive: `None` after
+    /// decoding.
+    pub first_frame: Option<usize>,
 }
 
 /// Parameters that are needed to decode a [`Column`].
@@ -299,6 +303,7 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
     let zeros = |column: &ColumnShape| Column {
         name: column.name.clone(),
         values: AttributeValues::zeros(column.planes, shape.gaussians),
+        first_frame: None,
     };
     let mut columns: Vec<Column> = shape.columns.iter().map(zeros).collect();
     let grid = QuantizationGrid::new(shape.steps[0]);

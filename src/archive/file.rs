@@ -69,6 +69,12 @@ impl ArchiveSize {
         ArchiveSize { cloud, field, rest: total - cloud - field }
     }
 
+    /// Returns the same size for an archive without tensors: the bytes of its empty section for the deformation field
+    /// count as other bytes.
+    pub(super) fn without_field(self) -> ArchiveSize {
+        ArchiveSize { field: 0, rest: self.rest + self.field, ..self }
+    }
+
     /// Returns the size of the whole archive in bytes.
     pub fn total(&self) -> u64 {
         self.cloud + self.field + self.rest

@@ -147,6 +147,7 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
     content.files.values().for_each(|bytes| blobs.extend(bytes));
     let table = serde_json::to_vec(&table).map_err(|error| Error::internal(error.to_string()))?;
     let (bytes, parts) = file::write(&Sections { table, cloud, field, blobs })?;
+    let parts = if content.tensors.is_empty() { parts.without_field() } else { parts };
     Ok(EncodedArchive { bytes, parts, order, bits })
 }
 
@@ -166,6 +167,7 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
     let places = table.tensors.iter().map(TensorEntry::places).max().unwrap_or(0) as u64;
     let needed = head.bytes() + 4 * values + 4 * places + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
+    let parts = if table.tensors.is_empty() { parts.without_field() } else { parts };
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
 
@@ -294,7 +296,7 @@ fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
     if content.columns.len() != steps.columns.len() {
         return Err(Error::internal("the columns of an archive have no quantization steps"));
     }
-    for Column { name, values } in &content.columns {
+    for Column { name, values, .. } in &content.columns {
         if values.len() != content.cloud.len() {
             return Err(Error::internal(format!("{} values of {name} for {}", values.len(), content.cloud.len())));
         }

@@ -55,7 +55,7 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
     for (name, width) in [("motion", 2), ("window", 1), ("none", 0)] {
         let mut values = AttributeValues::zeros(width, count);
         values.planes_mut().iter_mut().for_each(|value| *value = noise.next());
-        content.columns.push(Column { name: name.to_owned(), values });
+        content.columns.push(Column { name: name.to_owned(), values, first_frame: None });
     }
     content.extra_bytes = (0..3 * count).map(|i| (i * 7) as u8).collect();
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());

@@ -9,7 +9,7 @@ use crate::TOOL;
 use crate::archive::MAGIC;
 use crate::commands::convert_report::ConvertReport;
 use crate::compressed_model::CompressedModel;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::files::names::name_of;
 use crate::files::open::open_file;
@@ -17,6 +17,7 @@ use crate::journal::Journal;
 use crate::limits::ReadLimit;
 use crate::model::Attributes;
 use crate::models::archive::{holds_model_folder, read_archive, restored_output_kind, unpack};
+use crate::models::size::bytes_below;
 use crate::outputs::kind::{OutputKind, check_folder_name};
 use crate::pipeline::stage::PreparedArchive;
 use crate::pipeline::stages::archive::ArchiveStage;
@@ -42,12 +43,14 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 /// Restores the model in the archive at `path` in its original form, a model folder or a single file, and writes it to
 /// `output`. Returns `None` and writes nothing if `kind`, the requested format, is not the original format:
 /// - If the archive states the file layout of its model format, this layout determines the original format.
-/// - Otherwise the archive holds a model folder or a PLY file. It is restored if `kind` is either of the two.
+/// - Otherwise the archive holds a model folder or a PLY file. A folder is restored if `kind` is either of the two, a
+///   PLY file if `kind` is this format.
 ///
 /// After `None`, the caller opens the archive as an input and converts it.
 ///
 /// # Errors
-/// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.
+/// Fails if the archive is damaged or needs more than `memory`, if it holds a PLY file and `kind` is a model folder, or
+/// if the output exists already or cannot be written.
 pub fn unpack_archive(
     path: &Path,
     (output, kind): (&Path, OutputKind),
@@ -65,12 +68,12 @@ pub fn unpack_archive(
     let columns = content.columns.iter().map(|column| column.values.planes().len());
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).chain(columns).sum();
     let attributes = content.cloud.len() * Attributes::all().width(content.cloud.sh_degree());
-    let converted = |kind| ConvertReport {
+    let converted = |kind, bytes| ConvertReport {
         path: output.to_owned(),
         kind,
         gaussians: content.cloud.len(),
         frames: None,
-        bytes: 4 * (values + attributes) as u64,
+        bytes,
         larger: None,
         notes: vec![format!(
             "{} bytes of values from an archive of {} bytes",
@@ -80,21 +83,30 @@ pub fn unpack_archive(
     };
     let single = with_layout.map_or(!holds_model_folder(&content), |own| own != OutputKind::Model);
     if single {
+        if with_layout.is_none() && kind == OutputKind::Model {
+            return Err(Error::usage(format!(
+                "{}: the archive {} holds one PLY and no model folder\n  give a name that ends in .ply",
+                output.shown(),
+                path.shown()
+            )));
+        }
         check_target(output, TargetKind::File, &[path], overwrite)?;
         let staged = StagedFile::new(output, overwrite)?;
         unpack(&content, path, staged.path())?;
+        let bytes = bytes_below(staged.path())?;
         staged.commit()?;
-        return Ok(Some(converted(with_layout.unwrap_or(OutputKind::Ply))));
+        return Ok(Some(converted(with_layout.unwrap_or(OutputKind::Ply), bytes)));
     }
     check_folder_name(output, "convert")?;
     check_target(output, TargetKind::Folder, &[path], overwrite)?;
     let staged = StagedFolder::new(output, overwrite)?;
     unpack(&content, path, staged.path())?;
+    let bytes = bytes_below(staged.path())?;
     let marker = staged.path().join(SUMMARY_FILE);
     let text = serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } });
     fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
     staged.commit()?;
-    Ok(Some(converted(OutputKind::Model)))
+    Ok(Some(converted(OutputKind::Model, bytes)))
 }
 
 /// Writes all Gaussians of `input` to the archive `output`. The quantization steps are chosen so that renders of the

@@ -18,8 +18,7 @@ pub struct ConvertReport {
     pub gaussians: usize,
     /// Number of frames T of the input; `None` for an unpacked archive.
     pub frames: Option<usize>,
-    /// Size in bytes of the written files. For an unpacked archive: 4 bytes for each value of its Gaussians and
-    /// tensors, without headers and other files.
+    /// Size in bytes of the written files of the model, without the summary that marks an output folder.
     pub bytes: u64,
     /// Reason why the output has more bytes than the input; `None` if it does not have more.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -40,6 +40,8 @@ const FLAT_SCALE: f64 = 10.0;
 const MAX_COLOR_ERROR: f64 = 0.02;
 /// Maximum error of an SH coefficient above degree 0. A color is a sum of such coefficients times basis functions.
 const MAX_SH_ERROR: f64 = 1.0;
+/// Distance from the median position, in scene sizes, beyond which a message names a Gaussian as far from all others.
+const FAR_IN_SCENE_SIZES: f64 = 1000.0;
 /// Opacity below which a Gaussian is not drawn.
 const MIN_OPACITY: f64 = 1.0 / 255.0;
 
@@ -219,6 +221,25 @@ impl CodingErrors {
              {bound:.2e}{unit}, found {error:.2e}{why}"
         )))
     }
+}
+
+/// Names the Gaussians that are far from all others: further from the median position than [`FAR_IN_SCENE_SIZES`] times
+/// the median distance. `positions` has one row per Gaussian, or several; `id` returns the index of the Gaussian of a
+/// row. Returns for example "Gaussian 7 at (90000, 0.2, 1)", with at most three Gaussians; `None` if none is far.
+pub fn far_gaussians(positions: &AttributeValues, id: impl Fn(usize) -> usize) -> Option<String> {
+    let CodingErrors { middle, scene, .. } = CodingErrors::new(positions);
+    let far_distance = FAR_IN_SCENE_SIZES * scene;
+    let is_far = |&row: &usize| scene > 0.0 && distance(positions.row(row).map(f64::from), middle) > far_distance;
+    let rows = (0..positions.len()).filter(is_far);
+    let mut far: Vec<(usize, [f32; 3])> = rows.map(|row| (id(row), positions.row(row))).collect();
+    far.sort_by_key(|found| found.0);
+    far.dedup_by_key(|found| found.0);
+    let named = far.iter().take(3).map(|(id, [x, y, z])| format!("Gaussian {id} at ({x}, {y}, {z})"));
+    let mut text = named.collect::<Vec<_>>().join(", ");
+    if far.len() > 3 {
+        text.push_str(&format!(" and {} more", far.len() - 3));
+    }
+    (!far.is_empty()).then_some(text)
 }
 
 /// Returns the largest of the differences of two positions along x, y and z.

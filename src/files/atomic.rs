@@ -342,8 +342,9 @@ impl ScratchFolder {
     }
 }
 
-/// Returns `error` with a path that the user knows. Errors of system calls may contain a path in a hidden workspace,
-/// which the user has never seen. The path in the returned error is then:
+/// Returns `error` with a path that the user knows. Errors of system calls, and messages of writers that begin with the
+/// path of the file, may contain a path in a hidden workspace, which the user has never seen. The path in the returned
+/// error is then:
 ///
 /// - for an output: the output path that the user gave
 /// - for a scratch file: the folder that holds the scratch file
@@ -353,6 +354,13 @@ pub fn with_user_path(error: Error) -> Error {
     let (action, path, source) = match error {
         Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {
             (action, path, source)
+        }
+        Error::Usage(text) => {
+            let output = text.split_once(": ").and_then(|(path, rest)| match user_path(Path::new(path))? {
+                (output, false) => Some(format!("{}: {rest}", output.shown())),
+                _ => None,
+            });
+            return Error::Usage(output.unwrap_or(text));
         }
         error => return error,
     };

@@ -90,7 +90,7 @@ pub(super) fn bytes_read_for<'a>(paths: impl IntoIterator<Item = &'a Path>) -> R
 }
 
 /// Returns the size in bytes of a file, or of all files below a folder.
-pub(super) fn bytes_below(path: &Path) -> Result<u64> {
+pub(crate) fn bytes_below(path: &Path) -> Result<u64> {
     let found = fs::metadata(path).map_err(Error::io("read", path))?;
     if !found.is_dir() {
         return Ok(found.len());

@@ -12,7 +12,7 @@ use fourdgs::{GaussianSet, SceneExtras, WriteOptions, write_to_vec};
 
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::accuracy::{CodingErrors, RenderedAttributes};
+use crate::files::accuracy::{CodingErrors, RenderedAttributes, far_gaussians};
 use crate::fit::{FitError, LinearPiece, Tolerance, fit_lines};
 use crate::model::{AttributeValues, color_from_sh};
 use crate::passes::map_tracks;
@@ -50,10 +50,20 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     let options = WriteOptions { library: TOOL.to_owned(), ..WriteOptions::default() };
     let wanted = set.positions.clone();
     snap_to_grid(&mut set, &options);
-    let ids = found.iter().enumerate().flat_map(|(id, (pieces, _))| pieces.iter().map(move |_| id));
-    check_positions(&set, &wanted, ids)?;
-    let refused =
-        |error: fourdgs::Error| Error::usage(format!("{}: a .4dgs file cannot hold this model: {error}", path.shown()));
+    let ids: Vec<usize> =
+        found.iter().enumerate().flat_map(|(id, (pieces, _))| pieces.iter().map(move |_| id)).collect();
+    check_positions(&set, &wanted, ids.iter().copied())?;
+    let refused = |error: fourdgs::Error| {
+        let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
+        let why = match far_gaussians(&AttributeValues::from_planes(3, planes), |piece| ids[piece]) {
+            Some(far) => format!(
+                "all positions must lie within a limited range\n  far from all others in the output: {far}; drop them \
+                 (compress --drop-ids), or write a .ply or .gseq"
+            ),
+            None => format!("{error}\n  write a .ply or .gseq"),
+        };
+        Error::usage(format!("{}: a .4dgs file cannot hold this model: {why}", path.shown()))
+    };
     let bytes = write_to_vec(&set, starts[info.times.len()], &options, &SceneExtras::default()).map_err(refused)?;
     std::fs::write(path, bytes).map_err(Error::io("write", path))?;
     Ok(format!(

@@ -366,3 +366,120 @@ fn target_size_is_filled_by_count_and_bits_together() {
     }
     workplace.refused(2, &format!("compress {how} 1000"), &["--size", "expected at least"]);
 }
+
+/// Number of frames and number of Gaussians of the model of [`write_dynamic_3d_gaussians`].
+const STORED_FRAMES: [usize; 2] = [24, 80];
+
+/// Writes a Dynamic3DGaussians model (stored states of all frames) with one camera for each frame to the folder
+/// `model`. The Gaussians lie on a grid and move along circles.
+fn write_dynamic_3d_gaussians(model: &Path) {
+    use npyz::WriterBuilder;
+    let [frames, count] = STORED_FRAMES;
+    let mut npz = npyz::npz::NpzWriter::new(fs::File::create(model.join("params.npz")).unwrap());
+    let position = |frame: usize, i: usize, c: usize| {
+        let place = [i % 10, i / 10, i % 3].map(|place| 0.2 * place as f32 - 0.9);
+        let angle = 0.3 * frame as f32 + i as f32;
+        place[c] + 0.05 * [angle.cos(), angle.sin(), angle.cos()][c]
+    };
+    let rotation = |_: usize, i: usize, c: usize| [1.0, 0.01 * i as f32, 0.3, 0.0][c];
+    let color = |_: usize, i: usize, c: usize| 0.1 + 0.8 * ((7 * i + 3 * c) % 10) as f32 / 10.0;
+    type Value<'a> = &'a dyn Fn(usize, usize, usize) -> f32;
+    let arrays: [(&str, &[usize], Value<'_>); 5] = [
+        ("means3D", &[frames, count, 3], &position),
+        ("unnorm_rotations", &[frames, count, 4], &rotation),
+        ("rgb_colors", &[frames, count, 3], &color),
+        ("log_scales", &[count, 3], &|_, i, c| -2.5 + 0.1 * ((i + c) % 5) as f32),
+        ("logit_opacities", &[count, 1], &|_, i, _| 1.0 + 0.02 * i as f32),
+    ];
+    for (name, shape, value) in arrays {
+        let stored: Vec<u64> = shape.iter().map(|&length| length as u64).collect();
+        let options = zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored);
+        let mut array = npz.array::<f32>(name, options).unwrap().default_dtype().shape(&stored).begin_nd().unwrap();
+        let (width, outer) = (*shape.last().unwrap(), if shape.len() == 3 { frames } else { 1 });
+        let values = (0..outer * count * width).map(|k| value(k / (count * width), k / width % count, k % width));
+        array.extend(values).unwrap();
+        array.finish().unwrap();
+    }
+    write_cameras(model, frames);
+}
+
+/// Writes `transforms_train.json` with one camera of 64 × 64 pixels for each of `frames` frames to `folder`.
+fn write_cameras(folder: &Path, frames: usize) {
+    let matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]];
+    let camera = |frame: usize| {
+        let time = frame as f64 / (frames - 1).max(1) as f64;
+        serde_json::json!({ "file_path": format!("./train/f{frame:03}"), "time": time, "transform_matrix": matrix })
+    };
+    let cameras: Vec<_> = (0..frames).map(camera).collect();
+    let rig = serde_json::json!({ "camera_angle_x": 0.7, "w": 64, "h": 64, "frames": cameras });
+    fs::write(folder.join("transforms_train.json"), rig.to_string()).unwrap();
+}
+
+#[test]
+fn first_stored_frame_is_as_good_as_the_later_ones() {
+    let workplace = Workplace::new();
+    fs::create_dir(workplace.path("model")).unwrap();
+    write_dynamic_3d_gaussians(&workplace.path("model"));
+    workplace.done("convert model all.gsz --cameras model");
+    let run = workplace.done("evaluate model all.gsz --cameras model --json");
+    let found: serde_json::Value = serde_json::from_str(&run).unwrap();
+    let frames = found["per_frame"].as_array().unwrap();
+    let by_frame: Vec<f64> = frames.iter().map(|frame| frame["psnr"].as_f64().unwrap()).collect();
+    let mean = found["psnr"].as_f64().unwrap();
+    assert!(by_frame.len() == STORED_FRAMES[0] && by_frame[0] > mean - 3.0, "{by_frame:?}");
+}
+
+/// Writes `NAME.ply` with 900 Gaussians on a grid, the first of them moved to (`far`, 0, 0), and a camera.
+fn write_ply_with_far_gaussian(workplace: &Workplace, name: &str, far: f32) {
+    let mut gaussians = Gaussians::zeros(900, 0);
+    let place = |i: usize| [0.06 * (i % 30) as f32 - 0.9, 0.06 * (i / 30) as f32 - 0.9, 0.1 * (i % 7) as f32];
+    (0..900).for_each(|i| gaussians.position.set_row(i, place(i)));
+    gaussians.position.set_row(0, [far, 0.0, 0.0]);
+    gaussians.rotation.plane_mut(0).fill(1.0);
+    gaussians.log_scale.planes_mut().fill(-3.5);
+    gaussians.opacity_logit.planes_mut().fill(2.0);
+    gaussians.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k % 11) as f32 / 5.0 - 1.0);
+    workplace.ply(&format!("{name}.ply"), &gaussians);
+    write_cameras(&workplace.path(""), 1);
+}
+
+#[test]
+fn a_missed_quality_names_the_far_gaussian() {
+    let workplace = Workplace::new();
+    write_ply_with_far_gaussian(&workplace, "far", 3e4);
+    let run = workplace.run("convert far.ply far.gsz --cameras transforms_train.json");
+    let says = ["misses its quality: expected 50.0 dB", "Gaussian 0 at (30000, 0, 0)", "compress --drop-ids"];
+    assert!(run.code == 0 && says.iter().all(|part| run.stderr.contains(part)), "{}", run.stderr);
+    write_ply_with_far_gaussian(&workplace, "farther", 1e7);
+    let convert = "convert farther.ply farther.gsz --cameras transforms_train.json";
+    workplace.refused(2, convert, &["farther.ply: ", "expected 50.0 dB PSNR", "Gaussian 0 at (10000000, 0, 0)"]);
+    let compress = "compress farther.ply -o farther.gsz --cameras transforms_train.json --archive-psnr 45 --ratio 1 \
+                    --no-refine --prune-only";
+    workplace.refused(2, compress, &["expected the requested 45.0 dB PSNR"]);
+}
+
+#[test]
+fn a_4dgs_error_names_the_output_and_the_far_gaussian() {
+    let workplace = Workplace::new();
+    write_ply_with_far_gaussian(&workplace, "farther", 1e7);
+    let parts = ["/farther.4dgs: a .4dgs file cannot", "Gaussian 0 at (10000000, 0, 0)", "compress --drop-ids"];
+    workplace.refused(2, "convert farther.ply farther.4dgs", &parts);
+}
+
+#[test]
+fn unpacking_reports_the_bytes_of_the_files() {
+    let workplace = Workplace::new();
+    write_ply_with_far_gaussian(&workplace, "near", 0.0);
+    let info = |name: &str| -> serde_json::Value {
+        serde_json::from_str(&workplace.done(&format!("info {name} --json"))).unwrap()
+    };
+    workplace.done("convert near.ply near.gsz --cameras transforms_train.json");
+    assert_eq!(info("near.gsz")["size"]["field"], 0, "{}", info("near.gsz"));
+    workplace.refused(2, "convert near.gsz back", &["back: the archive near.gsz holds one PLY", ".ply"]);
+    let report: serde_json::Value = serde_json::from_str(&workplace.done("convert near.gsz back.ply --json")).unwrap();
+    assert_eq!(report["bytes"], fs::metadata(workplace.path("back.ply")).unwrap().len());
+    workplace.done(&format!("compress {TINY} -o small.gsz"));
+    let report: serde_json::Value = serde_json::from_str(&workplace.done("convert small.gsz small --json")).unwrap();
+    let written = lasting_files(&workplace.path("small")).values().map(Vec::len).sum::<usize>();
+    assert_eq!(report["bytes"], written);
+}

@@ -16,7 +16,7 @@ use super::files::yaml_without_folders;
 use super::layout::{
     Field, FileLayout, LAYOUT, Layout, Span, Values, first_column_plane, first_plane, plain_path, rest_name,
 };
-use crate::archive::{ArchiveContent, Column, TensorRole};
+use crate::archive::{self, ATTRIBUTES, ArchiveContent, Column, TensorRole};
 use crate::deform::Tensor;
 use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, TensorView, ValueType};
@@ -285,7 +285,7 @@ impl Packer {
         }
         let mut values = AttributeValues::zeros(planes.len(), self.content.cloud.len());
         planes.iter().enumerate().for_each(|(c, plane)| values.plane_mut(c).copy_from_slice(plane));
-        columns.push(Column { name: unique, values });
+        columns.push(Column { name: unique, values, first_frame: None });
         first_column_plane(self.content.cloud.sh_degree()) + first
     }
 
@@ -460,7 +460,12 @@ impl Packer {
                 .flat_map(|c| (start..frames).map(move |frame| (frame, c)))
                 .map(|(frame, c)| plane(frame, c))
                 .collect();
-            let first = if columns.is_empty() { 0 } else { self.add_column(&entry.name, columns) };
+            let mut first = 0;
+            if !columns.is_empty() {
+                first = self.add_column(&entry.name, columns);
+                let index = |attribute| (0..ATTRIBUTES.len()).find(|&k| archive::attribute(k) == attribute);
+                self.content.columns.last_mut().iter_mut().for_each(|to| to.first_frame = attribute.and_then(index));
+            }
             for frame in 0..frames {
                 let field = |c: usize| match attribute.filter(|_| frame == 0) {
                     Some(attribute) => Field::F32(first_plane(attribute) + c),

@@ -20,7 +20,7 @@ fn content() -> ArchiveContent {
     let mut content = ArchiveContent { cloud: Gaussians::zeros(COUNT, 0), ..ArchiveContent::default() };
     (0..COUNT).for_each(|i| content.cloud.position.set_row(i, [i as f32, 0.5, -1.0]));
     let values = AttributeValues::from_planes(1, vec![0.25, 0.5, 1.0]);
-    content.columns.push(Column { name: "width".into(), values });
+    content.columns.push(Column { name: "width".into(), values, first_frame: None });
     content.tensors.insert("weights".into(), Tensor { shape: vec![2], data: vec![1.5, -2.0] });
     content.extra_bytes = (0..2 * COUNT as u8).collect();
     content.files.insert(rest_name(0), b"headtail".to_vec());

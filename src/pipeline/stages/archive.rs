@@ -188,6 +188,8 @@ impl ArchiveStage {
             };
             Ok(((archived, AsToml(summary)), compressed.len()))
         })?;
+        let quality_target = QualityTarget::new(self.psnr, archive_target, summary.level);
+        journal.notes.extend(check_met(scene, compressed, (quality_target, self.psnr), &summary)?);
         if self.refine.is_some() && !summary.is_refined {
             let is_close = summary.level >= ENOUGH_PSNR && archive_target == ArchiveTarget::Nothing;
             let why = match is_close {
@@ -239,11 +241,7 @@ impl ArchiveStage {
         let is_refined = refined.is_some();
         let found = match refined {
             Some(refined) => refined,
-            None => {
-                let found = quantizer.archive(target)?;
-                check_met(target, target.required_psnr(level), found.psnr)?;
-                found
-            }
+            None => quantizer.archive(target)?,
         };
         let MeasuredArchive { encoded, psnr, loss, .. } = found;
         let (parts, bits) = (Some(encoded.parts), encoded.bits.clone());

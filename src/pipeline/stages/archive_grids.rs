@@ -4,7 +4,8 @@
 use std::collections::BTreeMap;
 
 use crate::archive::{
-    self, ATTRIBUTES, ArchiveContent, FIRST_SH_ATTRIBUTE, QuantizationSteps, STEP_NUMBERS, TensorRole, TensorSteps,
+    self, ATTRIBUTES, ArchiveContent, Column, FIRST_SH_ATTRIBUTE, QuantizationSteps, STEP_NUMBERS, TensorRole,
+    TensorSteps,
 };
 use crate::error::Result;
 use crate::pipeline::stages::reference_views::{ReferenceViews, step_change};
@@ -20,12 +21,15 @@ const MAX_STEP: f64 = 4.0;
 /// of f32.
 const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 
-/// Group of values that share one quantization step: an attribute (by index), a further column of the Gaussians (by
-/// index and name) or a tensor of the deformation field (by name).
+/// Group of values that share one quantization step: an attribute (by index), a further column of the Gaussians or a
+/// tensor of the deformation field (by name).
 #[derive(Debug, Clone)]
 pub(super) enum ValueGroup {
     Attribute(usize),
-    Column(usize, String),
+    /// Column, by index and name. If the column holds the later frames of an attribute, the group also contains this
+    /// attribute (by index), which holds the first frame. Otherwise the step of the first frame could become far too
+    /// coarse, because no render that measures errors may show the first frame.
+    Column(usize, String, Option<usize>),
     Tensor(String),
 }
 
@@ -33,7 +37,7 @@ impl ValueGroup {
     fn name(&self) -> &str {
         match self {
             ValueGroup::Attribute(k) => ATTRIBUTES[*k],
-            ValueGroup::Column(_, name) | ValueGroup::Tensor(name) => name,
+            ValueGroup::Column(_, name, _) | ValueGroup::Tensor(name) => name,
         }
     }
 
@@ -83,8 +87,11 @@ impl Grids {
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
                 ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step(octave + added),
-                // The groups hold the columns in their order.
-                ValueGroup::Column(..) => steps.columns.push(nearest_step(octave + added)),
+                ValueGroup::Column(_, _, first_frame) => {
+                    // The groups hold the columns in their order.
+                    steps.columns.push(nearest_step(octave + added));
+                    first_frame.iter().for_each(|&k| steps.cloud[k] = nearest_step(octave + added));
+                }
                 ValueGroup::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
             }
         }
@@ -110,8 +117,11 @@ impl Grids {
         let errors = self.errors(scene, reference_views, content, progress)?;
         let fine = archive::encode(content, &self.steps(0.0))?.bits;
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
-        let bits =
-            |by_name: &BTreeMap<String, f64>, group: &ValueGroup| by_name.get(group.name()).copied().unwrap_or(0.0);
+        let bits = |by_name: &BTreeMap<String, f64>, group: &ValueGroup| {
+            let first_frame = if let ValueGroup::Column(.., Some(k)) = group { Some(ATTRIBUTES[*k]) } else { None };
+            let names = [Some(group.name()), first_frame].into_iter().flatten();
+            names.map(|name| by_name.get(name).copied().unwrap_or(0.0)).sum::<f64>()
+        };
         // At least 1: a group whose bits no longer fall could otherwise become coarser without end.
         let saved = |group: &ValueGroup| {
             (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group))
@@ -150,11 +160,16 @@ impl Grids {
                     content.cloud = before;
                     found
                 }
-                ValueGroup::Column(k, _) => {
-                    let before = content.columns[*k].clone();
-                    archive::round_column(&mut content.columns[*k], nearest_step(octave));
+                ValueGroup::Column(k, _, first_frame) => {
+                    let before = (content.columns[*k].clone(), first_frame.map(|_| content.cloud.clone()));
+                    let step = nearest_step(octave);
+                    archive::round_column(&mut content.columns[*k], step);
+                    if let Some(attribute) = first_frame {
+                        archive::round_cloud(&mut content.cloud, &[step; ATTRIBUTES.len()], &[*attribute]);
+                    }
                     let found = reference_views.error(&*scene.input.decode_frames(content)?);
-                    content.columns[*k] = before;
+                    content.columns[*k] = before.0;
+                    before.1.into_iter().for_each(|cloud| content.cloud = cloud);
                     found
                 }
                 ValueGroup::Tensor(name) => {
@@ -175,8 +190,11 @@ impl Grids {
 fn groups(content: &ArchiveContent) -> Vec<ValueGroup> {
     let attributes = FIRST_SH_ATTRIBUTE + content.cloud.sh_degree() + 1;
     let tensors = content.field.iter().filter(|(_, role)| !matches!(role, TensorRole::Exact | TensorRole::Unread));
-    let columns = content.columns.iter().enumerate().map(|(k, column)| ValueGroup::Column(k, column.name.clone()));
+    let column = |(k, column): (usize, &Column)| ValueGroup::Column(k, column.name.clone(), column.first_frame);
+    let columns = content.columns.iter().enumerate().map(column);
+    let is_in_column = |k: usize| content.columns.iter().any(|column| column.first_frame == Some(k));
     (0..attributes)
+        .filter(|&k| !is_in_column(k))
         .map(ValueGroup::Attribute)
         .chain(columns)
         .chain(tensors.map(|(name, _)| ValueGroup::Tensor(name.clone())))
@@ -198,7 +216,7 @@ fn deviation(content: &ArchiveContent, group: &ValueGroup) -> f64 {
     let found = match group {
         ValueGroup::Tensor(name) => deviation(&mut content.tensors[name].data.iter().copied()),
         ValueGroup::Attribute(k) => deviation(&mut archive::attribute_values(&content.cloud, *k)),
-        ValueGroup::Column(k, _) => {
+        ValueGroup::Column(k, ..) => {
             let values = content.columns[*k].values.planes();
             let largest = values.iter().fold(0.0, |largest: f32, value| largest.max(value.abs()));
             // Values that are all equal keep about the precision of f32.

@@ -21,7 +21,7 @@ use crate::outputs::container::{
 };
 use crate::pipeline::stages::reference_views::{
     ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, OCTAVE_HALVINGS, OCTAVE_RANGE,
-    QualityTarget, ReferenceViews, bisect, check_measurable, check_met, step_change,
+    QualityTarget, ReferenceViews, bisect, check_measurable, step_change,
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::scene::{Scene, first_frame_box};
@@ -64,8 +64,8 @@ pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
 /// `source`. Returns the bounds and the summary of the archive.
 ///
 /// # Errors
-/// Fails if frames cannot be read, if renders are not finite, if an archive with the widest bounds exceeds the byte
-/// limit, or if the required PSNR is missed by far ([`check_met`]).
+/// Fails if frames cannot be read, if renders are not finite, or if an archive with the widest bounds exceeds the byte
+/// limit.
 pub(crate) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
@@ -133,7 +133,6 @@ pub(crate) fn find(
             best.map_or_else(|| measure_views(widened(&widths, OCTAVE_RANGE[0])), Ok)?
         }
     };
-    check_met(quality_target, required_psnr, psnr)?;
     let names = Attributes::all().iter().map(|column| column.name().to_owned());
     let bounds = names.zip(widths).collect();
     let bits = BTreeMap::new();
