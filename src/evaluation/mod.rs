@@ -356,13 +356,7 @@ impl ModelPair {
                 cameras: self.views.iter().map(|view| view.camera).collect::<HashSet<_>>().len(),
                 pairs: self.views.len(),
             },
-            split: match self.split {
-                None => "all",
-                Some(Split::Train) => "train",
-                Some(Split::Val) => "val",
-                Some(Split::Test) => "test",
-            }
-            .to_owned(),
+            split: self.split.map_or("all", Split::name).to_owned(),
             background: self.background,
             loss: Comparison::from_views(&view_qualities, |view| Some(view.loss)).expect("every view has this score"),
             rig_sides: InsideOutsideMeans::from_views(&view_qualities, &self.outside_views()),

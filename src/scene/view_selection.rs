@@ -55,8 +55,8 @@ pub(crate) fn distinct_views(rig: &Rig, views: impl Iterator<Item = FrameView>) 
 /// Returns the error that the chosen split has no views. It names the splits of `rig` that have some.
 pub fn no_view_error(rig: &Rig) -> Error {
     let has = |split: &Split| rig.views.iter().any(|rig_view| rig_view.split == *split);
-    let named = [(Split::Train, "train"), (Split::Val, "val"), (Split::Test, "test")];
-    let available: Vec<&str> = named.iter().filter(|(split, _)| has(split)).map(|(_, name)| *name).collect();
+    let splits = [Split::Train, Split::Val, Split::Test];
+    let available: Vec<&str> = splits.iter().filter(|split| has(split)).map(|split| split.name()).collect();
     Error::usage(format!(
         "{}: the cameras have no views in this split\n  they have views of {}; use --split {} or --split all",
         rig.origin,

@@ -21,6 +21,17 @@ pub enum Split {
     Test,
 }
 
+impl Split {
+    /// Returns the name of the split in options and results: `train`, `val` or `test`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Split::Train => "train",
+            Split::Val => "val",
+            Split::Test => "test",
+        }
+    }
+}
+
 /// View of the scene: a camera at a time stamp. There may be a photograph of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigView {
