@@ -309,33 +309,35 @@ fn own_cameras_json_is_read_completely() {
 }
 
 #[test]
-fn distortion_of_a_pixel_is_refused_in_transforms() {
-    let with = |entries: &[(&str, Value)]| {
+fn distortion_in_transforms_is_ignored_and_reported_and_fisheye_is_refused() {
+    let with = |key: &str, value: &Value| {
         let mut file = transforms(&[0.0, 1.0]);
-        entries.iter().for_each(|(key, value)| file[*key] = value.clone());
+        file[key] = value.clone();
         file
     };
     let undistorted = load_json("transforms.json", &transforms(&[0.0, 1.0])).unwrap();
-    for entries in [
-        // Moves the corners at (±0.55, ±0.41) by k1 r³ f = 0.8 pixels.
-        &[("k1", json!(0.035)), ("camera_model", json!("OPENCV"))][..],
-        &[("k1", json!(0.0)), ("p2", json!(0)), ("camera_model", json!("PINHOLE")), ("is_fisheye", json!(false))],
+    // Corners at (±0.55, ±0.41) are moved by k1 r³ f: 0.8 pixels for 0.035, and 1.2 pixels for 0.05.
+    for (key, value, note) in [
+        ("k1", json!(0.0), ""),
+        ("camera_model", json!("OPENCV"), ""),
+        ("is_fisheye", json!(false), ""),
+        ("k1", json!(0.035), ""),
+        ("k1", json!(0.05), " (lens distortion of up to 1.2 pixels ignored)"),
     ] {
-        assert_eq!(load_json("transforms.json", &with(entries)).unwrap().cameras, undistorted.cameras);
+        let found = load_json("transforms.json", &with(key, &value)).unwrap();
+        assert_eq!(found.cameras, undistorted.cameras);
+        assert_eq!(found.origin, format!("transforms.json{note}"), "{key} {value}");
     }
-    for (key, value) in [
-        ("k1", json!(0.05)),
-        ("k4", json!(-3.0)),
-        ("p1", json!(0.1)),
-        ("camera_model", json!("OPENCV_FISHEYE")),
-        ("is_fisheye", json!(true)),
-    ] {
-        let expected = [key, "without distortion", "undistort the images"];
-        assert_refused("transforms.json", &with(&[(key, value.clone())]), &expected);
+    for (key, value) in [("camera_model", json!("OPENCV_FISHEYE")), ("is_fisheye", json!(true))] {
+        let expected = [key, "a perspective camera", "undistort the images"];
+        assert_refused("transforms.json", &with(key, &value), &expected);
         let mut of_one_image = transforms(&[0.0, 1.0]);
         of_one_image["frames"][1][key] = value;
         assert_refused("transforms.json", &of_one_image, &[&expected[..], &["frame 1"]].concat());
     }
+    let mut of_one_image = with("k1", &json!(0.0));
+    of_one_image["frames"][1]["p1"] = json!(0.1);
+    assert!(load_json("transforms.json", &of_one_image).unwrap().origin.contains("pixels ignored"));
 }
 
 #[test]

@@ -3,8 +3,8 @@
 //! Intrinsics are `fl_x fl_y cx cy w h`, or `camera_angle_x` (and `camera_angle_y`), the field of view in radians. They
 //! are keys of the image or, for all images, of the file; a key of the image takes precedence. Pixels are square and
 //! the principal point is the middle of the image unless the file states otherwise. An image has `file_path`,
-//! `transform_matrix` and, if the scene moves, `time`. Lens distortion (`k1` …) is refused if it moves a corner of the
-//! image by [`MAX_SHIFT_PX`] or more, and ignored otherwise. Splits are stated by the names of the files, or by lists of
+//! `transform_matrix` and, if the scene moves, `time`. Lens distortion (`k1` …) is ignored, as by the trainers, which undistort
+//! the photographs; if it moves a corner of an image by [`MAX_SHIFT_PX`] or more, the rig says so. Splits are stated by the names of the files, or by lists of
 //! images in a file ([`SPLIT_LISTS`], Nerfstudio).
 //!
 //! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
@@ -65,8 +65,7 @@ const SPLIT_ENTRY_BYTES: u64 = 3 * 32 + 32;
 /// Values of `camera_model` of cameras without distortion, or with the distortion that [`shift_by_lens`] computes.
 const PERSPECTIVE_MODELS: [&str; 5] = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
 
-/// Shift in pixels of a corner of an image by lens distortion, from which the image is refused. A smaller shift does not
-/// change which Gaussians are visible.
+/// Shift in pixels of a corner of an image by lens distortion, from which the rig says that distortion was ignored.
 const MAX_SHIFT_PX: f64 = 1.0;
 
 /// Reads the cameras in `file`, the `transforms*.json` of one split (training, validation or test). The files of the
@@ -84,15 +83,20 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
     }
     files.sort_by_key(|file| split_of(file) as u8);
     let mut builder = RigBuilder::new(options.memory);
+    let mut shift = 0.0;
     for file in &files {
-        add_file(&mut builder, file, options)?;
+        shift = add_file(&mut builder, file, options)?.max(shift);
     }
     let latest = builder.latest(latest);
     if latest > 0.0 && options.clock == TimeConvention::Normalized {
         builder.divide_times(latest);
     }
     let names: Vec<String> = files.iter().map(|path| shown_name(path)).collect();
-    builder.finish(None, names.join(" and "))
+    let lens = match shift < MAX_SHIFT_PX {
+        true => String::new(),
+        false => format!(" (lens distortion of up to {shift:.1} pixels ignored)"),
+    };
+    builder.finish(None, names.join(" and ") + &lens)
 }
 
 /// Returns the split named in a file name (train, val or test); training if the name contains none.
@@ -129,15 +133,21 @@ fn latest_in(file: &Path) -> Result<f64> {
     Ok(latest)
 }
 
-/// Adds the images listed in `file` to `builder`.
-fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> Result<()> {
+/// Adds the images listed in `file` to `builder`. Returns the largest shift of a corner of an image by lens distortion,
+/// pixels.
+fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> Result<f64> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
     builder.begin_file(file, shared.list_len("frames")?)?;
     let splits = listed_splits(file, &outline, builder.memory_counter())?;
+    let mut largest: f64 = 0.0;
     each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
-        builder.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, &splits, options)?)
-    })
+        let fields = CameraFields::new(file, Some(index), frame)?;
+        let (image, shift) = listed_image(file, shared, fields, &splits, options)?;
+        largest = largest.max(shift);
+        builder.add(image)
+    })?;
+    Ok(largest)
 }
 
 /// Reads the lists of splits ([`SPLIT_LISTS`]) in `file`. Returns the split of each image that they name. `outline` is
@@ -164,28 +174,30 @@ fn relative(name: &str) -> &str {
 }
 
 /// Builds an image from its own keys `image_fields` and the keys `shared` by all images of the file. `splits` are the
-/// splits that lists in the file state. Fails if the camera is invalid or has distortion.
+/// splits that lists in the file state. Returns the image, and the largest shift of its corners by lens distortion in
+/// pixels. Fails if the camera is invalid or a fisheye camera.
 fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,
     image_fields: CameraFields<'_>,
     splits: &HashMap<String, Split>,
     options: &CameraOptions,
-) -> Result<ListedImage> {
+) -> Result<(ListedImage, f64)> {
     let name = image_fields.optional_text("file_path")?;
     let image = name.map(|name| resolve(file, name));
     let size = size(shared, image_fields, image.as_deref(), options)?;
     let intrinsics = intrinsics(shared, image_fields, size)?;
-    check_lens(shared, image_fields, size, intrinsics)?;
+    let shift = lens_shift(shared, image_fields, size, intrinsics)?;
     let split = name.and_then(|name| splits.get(relative(name))).copied().unwrap_or_else(|| split_of(file));
     let (rotation, center) = image_fields.pose("transform_matrix")?;
-    Ok(ListedImage {
+    let image = ListedImage {
         camera: from_camera_to_world(size, intrinsics, rotation * OPENGL_TO_OPENCV, center),
         time: image_fields.optional_number("time")?,
         split,
         image,
         view: name.and_then(view_in_name),
-    })
+    };
+    Ok((image, shift))
 }
 
 /// Returns the width and height of an image in pixels: from the camera file, else from the image file, else from the
@@ -243,16 +255,17 @@ fn intrinsics(
     Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
 }
 
-/// Checks that the camera of an image is a pinhole camera, whose distortion moves no corner of the image by
-/// [`MAX_SHIFT_PX`] or more. `size` is the image size, and `intrinsics` are fx, fy, cx, cy, all in pixels. The keys
-/// `image_fields` of the image take precedence over the keys `shared` by all images. Fails for other cameras.
-fn check_lens(
+/// Returns the largest shift of a corner of an image by the lens distortion of its camera, pixels; 0 without distortion.
+/// `size` is the image size, and `intrinsics` are fx, fy, cx, cy, all in pixels. The keys `image_fields` of the image
+/// take precedence over the keys `shared` by all images. Fails for fisheye cameras and other cameras that no pinhole
+/// camera approximates.
+fn lens_shift(
     shared: CameraFields<'_>,
     image_fields: CameraFields<'_>,
     (width, height): (u32, u32),
     [fx, fy, cx, cy]: [f64; 4],
-) -> Result<()> {
-    const EXPECTED: &str = "a camera without distortion (SIMPLE_PINHOLE or PINHOLE)";
+) -> Result<f64> {
+    const EXPECTED: &str = "a perspective camera (such as PINHOLE or OPENCV)";
     const ADVICE: &str = "undistort the images, and export their cameras again";
     for fields in [image_fields, shared] {
         if let Some(model) = fields.optional_text("camera_model")? {
@@ -266,30 +279,16 @@ fn check_lens(
         return Err(fields.wrong("is_fisheye", EXPECTED).hint(ADVICE));
     }
     let mut coefficients = [0.0; 6];
-    let mut stated = None;
     for (key, value) in ["k1", "k2", "k3", "k4", "p1", "p2"].into_iter().zip(&mut coefficients) {
-        for fields in [image_fields, shared] {
-            if let Some(found) = fields.optional_number(key)? {
-                *value = found;
-                stated = stated.or((found != 0.0).then_some((fields, key)));
-                break;
-            }
-        }
+        let own = image_fields.optional_number(key)?;
+        *value = own.map_or_else(|| shared.optional_number(key), |own| Ok(Some(own)))?.unwrap_or(0.0);
     }
-    let Some((fields, key)) = stated else { return Ok(()) };
     let corners = [(0, 0), (width, 0), (0, height), (width, height)];
     let shifts = corners.map(|(x, y)| {
         let [dx, dy] = shift_by_lens([(f64::from(x) - cx) / fx, (f64::from(y) - cy) / fy], coefficients);
         (dx * fx).hypot(dy * fy)
     });
-    // Test `all` shifts rather than their maximum, because a maximum would ignore NaN.
-    if shifts.iter().all(|shift| *shift < MAX_SHIFT_PX) {
-        return Ok(());
-    }
-    let largest = shifts.into_iter().fold(0.0, f64::max);
-    Err(fields.wrong(key, EXPECTED).hint(format!(
-        "it moves a corner of the image by {largest:.1} pixels: {ADVICE} (or remove k1 to p2 if they are undistorted)"
-    )))
+    Ok(shifts.into_iter().fold(0.0, f64::max))
 }
 
 /// Returns the shift of the point (x, y) of the image plane at depth 1 by the lens distortion k1, k2, k3, k4, p1, p2 of
