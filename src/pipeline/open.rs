@@ -7,8 +7,8 @@
 //!
 //! The time span and the number of frames are known only at the end of the stream. Until then two assumptions are made:
 //! frames are evenly spaced, and every view, with its time as a fraction of the last view's, has exactly the time of a
-//! frame. If an assumption proves wrong, the
-//! statistics are computed again from the packed frames in the container; the result is the same in both cases.
+//! frame. If an assumption proves wrong, the statistics are computed again from the packed frames in the container; the
+//! result is the same in both cases.
 
 use std::cell::OnceCell;
 use std::io::Stdin;
