@@ -275,13 +275,14 @@ fn scored_views(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
 
 /// Returns a note if the 1st or 99th percentile of a term of the score differs from that of the run that wrote the
 /// compressed model. The scores in the report then differ from the scores by which Gaussians were removed. Returns no
-/// note if pruning rounds removed the Gaussians: the run then measured its scores on few frames and pixels.
+/// note if pruning rounds removed the Gaussians, down to a number that the user gave: the run then measured its scores
+/// on few frames and pixels.
 fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
     let (summary, _) = run.summary.as_ref()?;
-    let measures_little = run.recipe.as_ref().is_some_and(|recipe| recipe.scan.scan_frames == ScanFrames::Needed);
-    if measures_little && summary.stages.iter().any(|stage| stage.name == rounds::NAME) {
+    let may_measure_little = run.recipe.as_ref().is_some_and(|recipe| recipe.scan.scan_frames == ScanFrames::Needed);
+    if may_measure_little && run.has_target && summary.stages.iter().any(|stage| stage.name == rounds::NAME) {
         return None;
     }
     let found = scored.term_summaries();

@@ -14,6 +14,7 @@ use crate::files::names::shown_name;
 use crate::files::npy::header_is_sound;
 use crate::files::open::open_file;
 use crate::files::text::read_text;
+use crate::pipeline::RecipeRecord;
 use crate::pipeline::stages::write::{INDEX_MAP_FILE, RECIPE_FILE, companion_path};
 use crate::pipeline::summary::Summary;
 use crate::recipe::Recipe;
@@ -37,6 +38,8 @@ pub struct RunFiles {
     pub summary: Option<(Summary, Value)>,
     /// Recipe (parameters) of the `compress` run that wrote the compressed model.
     pub recipe: Option<Recipe>,
+    /// Whether the user of this run gave the number or the fraction of Gaussians to keep.
+    pub has_target: bool,
     /// Fate of every Gaussian of the original (kept, merged or dropped), from the index map (file that maps input to
     /// output Gaussians).
     pub fates: Option<Vec<Fate>>,
@@ -59,7 +62,7 @@ impl RunFiles {
             Err(why) => run.missing.push(format!("{}: {why}", shown_name(&summary))),
         }
         match read_recipe(&recipe) {
-            Ok(found) => run.recipe = Some(found),
+            Ok((found, has_target)) => (run.recipe, run.has_target) = (Some(found), has_target),
             Err(why) => run.missing.push(format!("{}: {why}", shown_name(&recipe))),
         }
         match read_fates(&map, original, compressed) {
@@ -82,9 +85,11 @@ fn read_summary(path: &Path) -> Result<(Summary, Value), String> {
     Ok((summary, whole))
 }
 
-fn read_recipe(path: &Path) -> Result<Recipe, String> {
+/// Returns the recipe in the file `path`, and whether the file states a number or a fraction of Gaussians to keep.
+fn read_recipe(path: &Path) -> Result<(Recipe, bool), String> {
     let text = read_text(path, MAX_RECIPE).map_err(|e| e.to_string())?;
-    Recipe::from_toml(&text, "default")
+    let record = RecipeRecord::read(&text, Path::new(""))?;
+    Ok((Recipe::from_toml(&text, "default")?, record.run.is_some_and(|run| run.target().is_some())))
 }
 
 fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fate>, String> {
