@@ -12,7 +12,7 @@ use crate::error::Result;
 pub(super) struct StepInput {
     /// Index of the target view to which the step fits the parameters.
     pub(super) view: usize,
-    /// Color values of the target view ([`Targets::values`]).
+    /// Colors of the pixels of the target view, as integers of 16 bits ([`Targets::values`]).
     pub(super) target: Vec<u16>,
     /// State of the frame of the target view as the scratch file holds it, without the deltas of the optimizers.
     pub(super) frame: LinearizedState,

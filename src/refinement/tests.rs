@@ -310,14 +310,18 @@ fn models_without_possible_gain_stay_unchanged() {
     assert_eq!((none.len(), journal.left_out.len()), (0, 1));
 }
 
+/// Returns a scene with explicit frames, which is written to `folder`, and one with a deformation field.
+fn explicit_and_deformed(folder: &std::path::Path) -> [Scene; 2] {
+    let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+    let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
+    [scene(folder), open_scene(&options).unwrap()]
+}
+
 #[test]
 fn reading_ahead_does_not_change_steps() {
     let folder = tempfile::tempdir().unwrap();
-    let explicit = scene(folder.path());
-    let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
-    let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-    for scene in [explicit, open_scene(&options).unwrap()] {
+    for scene in explicit_and_deformed(folder.path()) {
         let targets = Targets::new(&scene, TargetViewParams::at_most(60), NonZeroU32::MIN, false).unwrap();
         let kept = (0..scene.source().info().count as u32).step_by(2).collect();
         let compressed = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
@@ -343,10 +347,7 @@ fn reading_ahead_does_not_change_steps() {
 #[test]
 fn the_optimizer_restarts_and_continues_with_a_subset() {
     let folder = tempfile::tempdir().unwrap();
-    let explicit = scene(folder.path());
-    let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
-    let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
-    for scene in [explicit, open_scene(&options).unwrap()] {
+    for scene in explicit_and_deformed(folder.path()) {
         let targets = Targets::new(&scene, TargetViewParams::at_most(520), NonZeroU32::MIN, false).unwrap();
         let count = scene.source().info().count;
         let kept = (0..count as u32).step_by(2).collect();

@@ -126,8 +126,8 @@ impl Renderer {
         }
     }
 
-    /// Returns the number of tasks into which a loop should be divided: 1 if only one thread works on a view. Results
-    /// do not depend on it.
+    /// Returns the number of parallel tasks into which the work on a view is divided, or 1 if one thread does it all.
+    /// Results do not depend on this number.
     pub(super) fn task_count(&self) -> usize {
         match rayon::current_num_threads() {
             threads if self.parallel && threads > 1 => TASKS_PER_THREAD * threads,
@@ -196,11 +196,7 @@ impl Renderer {
                 let pixels = rest.iter_mut().filter_map(|row| row.split_off_mut(..len.min(row.len()))).collect();
                 (y, tiles, pixels)
             });
-            if task_count > 1 {
-                parts.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(render_part);
-            } else {
-                parts.for_each(render_part);
-            }
+            for_each_part(parts, task_count, render_part);
         }
         Image { width, height, data }
     }
@@ -326,10 +322,19 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
             sums = after;
         }
     };
+    for_each_part(parts, task_count, fill_part);
+}
+
+/// Calls `process` with each of `parts`: in parallel, one task per part, if `task_count` is more than 1.
+pub(super) fn for_each_part<T: Send>(
+    parts: impl Iterator<Item = T>,
+    task_count: usize,
+    process: impl Fn(T) + Send + Sync,
+) {
     if task_count > 1 {
-        parts.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(fill_part);
+        parts.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(process);
     } else {
-        parts.for_each(fill_part);
+        parts.for_each(process);
     }
 }
 

@@ -24,7 +24,7 @@ use super::bin::STRIP_PAIRS;
 use super::blend::SampledPixels;
 use super::grid::SampledView;
 use super::project::CameraTerms;
-use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
+use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs, for_each_part};
 use splat_core::{Attributes, Gaussians, GradientSpan, Gradients};
 use sums::{ImageGradientSums, SplatSums};
 use tile::{GradientSink, PixelGradients};
@@ -88,11 +88,7 @@ impl Renderer {
                 [span.ids().start, span.ids().end].map(|id| splats.partition_point(|splat| (splat.id as usize) < id));
             splat::add_gradients(gaussians, &splats[start..end], &sums[start..end], &view, &mut span);
         };
-        if self.task_count() > 1 {
-            out.spans(span).into_par_iter().with_max_len(1).for_each(add);
-        } else {
-            out.spans(span).into_iter().for_each(add);
-        }
+        for_each_part(out.spans(span).into_iter(), self.task_count(), add);
         value
     }
 
