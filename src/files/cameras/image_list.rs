@@ -8,13 +8,8 @@ use crate::files::json::lists::{ListSelection, each_element};
 use crate::files::json::small::{Keep, SmallValue};
 use crate::files::json::{ParseAbort, read};
 
-/// Keys that [`outline`] reads: keys that show in which format the camera file is, and keys whose values hold for all
-/// images of the file.
-const OUTLINE_KEYS: [&str; 25] = [
-    "frames",
-    "w2c",
-    "transform_matrix",
-    "k",
+/// Keys of intrinsics and lens distortion. They belong to an image or, for all images, to the file.
+pub(super) const INTRINSIC_KEYS: [&str; 16] = [
     "w",
     "h",
     "fl_x",
@@ -31,6 +26,15 @@ const OUTLINE_KEYS: [&str; 25] = [
     "p2",
     "camera_model",
     "is_fisheye",
+];
+
+/// Keys that [`outline`] reads besides [`INTRINSIC_KEYS`]: keys that show in which format the camera file is, and other
+/// keys whose values hold for all images of the file.
+const OUTLINE_KEYS: [&str; 9] = [
+    "frames",
+    "w2c",
+    "transform_matrix",
+    "k",
     "train_filenames",
     "val_filenames",
     "test_filenames",
@@ -47,7 +51,7 @@ const MAX_ELEMENTS: usize = 4;
 /// # Errors
 /// Fails if the file is not valid JSON.
 pub(super) fn outline(file: &Path) -> Result<SmallValue> {
-    read(file, &ParseAbort::default(), Keep { keys: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
+    read_keys(file, &[&OUTLINE_KEYS[..], &INTRINSIC_KEYS].concat())
 }
 
 /// Reads the values of the keys `keys` from a small JSON file.

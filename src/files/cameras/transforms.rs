@@ -3,9 +3,9 @@
 //! Intrinsics are `fl_x fl_y cx cy w h`, or `camera_angle_x` (and `camera_angle_y`), the field of view in radians. They
 //! are keys of the image or, for all images, of the file; a key of the image takes precedence. Pixels are square and
 //! the principal point is the middle of the image unless the file states otherwise. An image has `file_path`,
-//! `transform_matrix` and, if the scene moves, `time`. Lens distortion (`k1` …) is ignored, as by the trainers, which undistort
-//! the photographs; if it moves a corner of an image by [`MAX_SHIFT_PX`] or more, the rig says so. Splits are stated by the names of the files, or by lists of
-//! images in a file ([`SPLIT_LISTS`], Nerfstudio).
+//! `transform_matrix` and, if the scene moves, `time`. Lens distortion (`k1` …) is ignored, as by the trainers, which
+//! undistort the photographs; if it moves a corner of an image by [`MAX_SHIFT_PX`] or more, the rig says so. Splits are
+//! stated by the names of the files, or by lists of images in a file ([`SPLIT_LISTS`], Nerfstudio).
 //!
 //! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
 //! were trained (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames 0 … T−1 and files
@@ -19,7 +19,7 @@ use hashbrown::HashMap;
 
 use super::assemble::{ListedImage, MemoryCounter, RigBuilder, from_camera_to_world, view_in_name};
 use super::fields::CameraFields;
-use super::image_list::{each_image, outline};
+use super::image_list::{INTRINSIC_KEYS, each_image, outline};
 use super::{CameraOptions, TimeConvention};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::image::measure;
@@ -30,28 +30,8 @@ use crate::model::{Rig, Split};
 /// Rotation from OpenGL camera axes (x right, y up, z backward) to OpenCV axes (x right, y down, z forward).
 const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
-/// Keys that are read from the entry of an image in `transforms*.json`.
-const IMAGE_KEYS: [&str; 19] = [
-    "file_path",
-    "w",
-    "h",
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
-    "camera_model",
-    "is_fisheye",
-    "camera_angle_x",
-    "camera_angle_y",
-    "transform_matrix",
-    "time",
-];
+/// Keys that are read from the entry of an image in `transforms*.json` besides [`INTRINSIC_KEYS`].
+const IMAGE_KEYS: [&str; 3] = ["file_path", "transform_matrix", "time"];
 
 /// Lists of image names by which Nerfstudio divides the images of a file into splits. An image in several lists belongs
 /// to the split of the last of them, an image in none to the split of the file.
@@ -141,7 +121,7 @@ fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> R
     builder.begin_file(file, shared.list_len("frames")?)?;
     let splits = listed_splits(file, &outline, builder.memory_counter())?;
     let mut largest: f64 = 0.0;
-    each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
+    each_image(file, Some("frames"), &[&IMAGE_KEYS[..], &INTRINSIC_KEYS].concat(), |index, frame| {
         let fields = CameraFields::new(file, Some(index), frame)?;
         let (image, shift) = listed_image(file, shared, fields, &splits, options)?;
         largest = largest.max(shift);
