@@ -121,7 +121,7 @@ impl CacheDir {
         }
     }
 
-    /// Checks that the work folder still exists. A vanished folder is an error, not an empty cache.
+    /// Checks that the cache folder still exists. A vanished folder is an error, not an empty cache.
     fn check_exists(&self) -> Result<()> {
         fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the cache folder", &self.folder))
     }

@@ -1,8 +1,8 @@
 //! Reader of photographs and renders in PNG and JPEG files.
 //!
-//! Input: a PNG of any color type and bit depth, or a JPEG, and the size it must have. Output: an [`Image`] with values
-//! in [0, 1], transparent pixels blended over a background. Memory: the bytes of a JPEG, the decoded rows and the
-//! result; the sizes of the image and of a JPEG file are checked before memory for them is allocated.
+//! Input: a PNG of any color type and bit depth, or a JPEG; and the size that the image must have. Output: an [`Image`]
+//! with values in [0, 1], transparent pixels blended over a background. Memory: the bytes of a JPEG, the decoded rows
+//! and the result; the sizes of the image and of a JPEG file are checked before memory for them is allocated.
 
 pub mod write;
 
@@ -22,7 +22,7 @@ use crate::render::Image;
 /// part for each pixel.
 const MAX_JPEG_BYTES: (u64, u64) = (16 << 20, 8);
 
-/// Advice for a file that is not a readable image.
+/// Advice to the user if a photograph cannot be read.
 const UNREADABLE: &str = "give photographs as PNG or JPEG files, and copy or export a damaged one again";
 
 /// Reads the PNG or JPEG at `path`, which must have `width` × `height` pixels. The first bytes of the file tell which

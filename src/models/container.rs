@@ -10,8 +10,8 @@ use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, TimeOrig
 use crate::models::opened::{FrameFormat, Opened};
 use crate::source::FrameSource;
 
-/// Format of containers of frames (`.gseq`), which store the state of every Gaussian at every frame: recognizes
-/// and opens a file.
+/// Format of containers of frames (`.gseq`), which store the state of every Gaussian at every frame: recognizes and
+/// opens a file.
 pub(super) const ENTRY: FrameFormat = FrameFormat {
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {

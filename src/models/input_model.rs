@@ -342,13 +342,13 @@ pub struct ColumnInfo {
     pub max: Option<f32>,
 }
 
-/// A model format: how its files are recognized and opened.
-pub(super) struct ModelFormat {
+/// A format: how its files are recognized and opened. `Input` is the result of opening them.
+pub(super) struct ModelFormat<Input = Box<dyn InputModel>> {
     /// Returns whether the input has this format, judged by the content of its files.
     pub(super) recognizes: fn(&FoundInput) -> bool,
     /// Opens the input. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no frames until frame
     /// times are set.
-    pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
+    pub(super) open: fn(&Path, &OpenOptions) -> Result<Input>,
 }
 
 /// Number of bytes at the start of a file by which its format is recognized; enough for the header of a

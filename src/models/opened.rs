@@ -64,19 +64,14 @@ impl Opened {
     }
 }
 
-/// Format of frames that may have to be linked: how its files are recognized and opened.
-pub(super) struct FrameFormat {
-    /// Returns whether the input has this format, judged by the content of its files.
-    pub(super) recognizes: fn(&FoundInput) -> bool,
-    /// Opens the input.
-    pub(super) open: fn(&Path, &OpenOptions) -> Result<Opened>,
-}
+/// Format of frames that may have to be linked.
+pub(super) type FrameFormat = ModelFormat<Opened>;
 
 /// Format that is read from files.
 pub(super) enum InputFormat {
-    /// Format of models, which identify their Gaussians.
+    /// Format of models. They tell which Gaussian is which at every frame.
     Model(ModelFormat),
-    /// Format of frames, which may have to be linked.
+    /// Format of frames. They may have to be linked.
     Frames(FrameFormat),
 }
 

@@ -117,21 +117,6 @@ pub struct OpenedInput {
     pub notes: Vec<String>,
 }
 
-impl OpenedInput {
-    /// Returns this input if it has frames or no Gaussians. `path` is the input in messages.
-    ///
-    /// # Errors
-    /// Fails if the input has Gaussians but no frame.
-    pub(super) fn with_frames(self, path: &Path) -> Result<OpenedInput> {
-        let info = self.input.source().info();
-        if info.times.is_empty() && info.count > 0 {
-            let found = format!("no frame, but {} Gaussians", info.count);
-            return Err(Error::input(path, "", "at least one frame", found));
-        }
-        Ok(self)
-    }
-}
-
 /// Opened input whose Gaussians may still have to be linked into tracks (Gaussians followed through frames), together
 /// with its cameras if it has any.
 pub struct UntrackedInput {
@@ -157,9 +142,14 @@ impl UntrackedInput {
         if let Some(times) = times {
             input = input.with_times(times)?;
         }
+        let info = input.source().info();
+        if info.times.is_empty() && info.count > 0 {
+            let found = format!("no frame, but {} Gaussians", info.count);
+            return Err(Error::input(path, "", "at least one frame", found));
+        }
         // Some notes of the input depend on the times of its frames.
         let notes = [input.notes(), notes].concat();
-        OpenedInput { input, rig, notes }.with_frames(path)
+        Ok(OpenedInput { input, rig, notes })
     }
 }
 

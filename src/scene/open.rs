@@ -136,7 +136,7 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
 /// # Errors
 /// Fails if the cameras belong to another scene, or if the split has no views.
 pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> {
-    let OpenedInput { input, rig, mut notes } = opened.with_frames(&options.path)?;
+    let OpenedInput { input, rig, mut notes } = opened;
     // A stream's number of frames is unknown when its run is planned, so a stream never counts as a scene without
     // motion.
     let is_still = !options.is_stream() && input.source().info().times.len() == 1;

@@ -106,8 +106,8 @@ impl Field {
     }
 }
 
-/// [`Evaluation`] that computes the result of [`Field::position_jacobian`] into `out`. `planes`: the feature planes with what was prepared for the
-/// positions; `None` if the field has no planes.
+/// [`Evaluation`] that computes the result of [`Field::position_jacobian`] into `out`. `planes`: the feature planes with
+/// what was prepared for the positions; `None` if the field has no planes.
 struct PositionJacobian<'a> {
     field: &'a Field,
     head: &'a Head,

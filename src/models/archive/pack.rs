@@ -255,7 +255,7 @@ impl Packer {
                     coded.push((group[0].to_field)(first_plane(*attribute) + c));
                 }
                 Target::Column(name) if is_finite => {
-                    let plane = self.add_column(name, planes);
+                    let plane = self.add_column(name, planes, None);
                     coded.extend(group.iter().enumerate().map(|(c, field)| (field.to_field)(plane + c)));
                 }
                 Target::Zeros => coded.push(Field::Zeros(width)),
@@ -271,9 +271,10 @@ impl Packer {
     }
 
     /// Adds a column called `name`, with one plane (scalar component of all Gaussians) for each entry of `planes`. If
-    /// another column has this name, a number is appended to it. Returns the index of the first plane of the column;
-    /// indices count the planes of all attributes, then those of all columns.
-    fn add_column(&mut self, name: &str, planes: Vec<Vec<f32>>) -> usize {
+    /// another column has this name, a number is appended to it. `first_frame`: attribute of which the column holds the
+    /// later frames, if any ([`Column::first_frame`]). Returns the index of the first plane of the column; indices count
+    /// the planes of all attributes, then those of all columns.
+    fn add_column(&mut self, name: &str, planes: Vec<Vec<f32>>, first_frame: Option<Attributes>) -> usize {
         let columns = &mut self.content.columns;
         let first = columns.iter().map(|column| column.values.width()).sum::<usize>();
         let is_taken = |name: &str| columns.iter().any(|column| column.name == name);
@@ -285,7 +286,8 @@ impl Packer {
         }
         let mut values = AttributeValues::zeros(planes.len(), self.content.cloud.len());
         planes.iter().enumerate().for_each(|(c, plane)| values.plane_mut(c).copy_from_slice(plane));
-        columns.push(Column { name: unique, values, first_frame: None });
+        let first_frame = first_frame.and_then(|found| (0..ATTRIBUTES.len()).find(|&k| archive::attribute(k) == found));
+        columns.push(Column { name: unique, values, first_frame });
         first_column_plane(self.content.cloud.sh_degree()) + first
     }
 
@@ -460,12 +462,7 @@ impl Packer {
                 .flat_map(|c| (start..frames).map(move |frame| (frame, c)))
                 .map(|(frame, c)| plane(frame, c))
                 .collect();
-            let mut first = 0;
-            if !columns.is_empty() {
-                first = self.add_column(&entry.name, columns);
-                let index = |attribute| (0..ATTRIBUTES.len()).find(|&k| archive::attribute(k) == attribute);
-                self.content.columns.last_mut().iter_mut().for_each(|to| to.first_frame = attribute.and_then(index));
-            }
+            let first = if columns.is_empty() { 0 } else { self.add_column(&entry.name, columns, attribute) };
             for frame in 0..frames {
                 let field = |c: usize| match attribute.filter(|_| frame == 0) {
                     Some(attribute) => Field::F32(first_plane(attribute) + c),

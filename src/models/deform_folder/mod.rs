@@ -16,7 +16,7 @@ use std::path::Path;
 
 pub(super) use arguments::Arguments;
 use paths::Paths;
-pub(super) use paths::{has_network, lacks_network, network_tensor_names};
+pub(super) use paths::{has_network, needs_network, network_tensor_names};
 
 use super::archive::pack::FileContent;
 use super::archive::reopen::Reopener;

@@ -34,13 +34,13 @@ pub(in crate::models) fn has_network(root: &Path) -> bool {
     iterations(&root.join(NETWORK_FOLDER), NETWORK_FILE).is_ok_and(|found| !found.is_empty())
 }
 
-/// Returns whether the folder `root` is a model folder whose network is missing: `cfg_args` has a key that only trainers
-/// of such networks write.
-pub(in crate::models) fn lacks_network(root: &Path) -> bool {
+/// Returns whether the model in the folder `root` needs a network: `cfg_args` has a key that only trainers of such
+/// networks write.
+pub(in crate::models) fn needs_network(root: &Path) -> bool {
     let arguments = read(&root.join("cfg_args")).unwrap_or_default();
     let names_network = ["deform_type=", "is_6dof="].iter().any(|key| arguments.contains(key));
     let is_still = arguments.contains("deform_type='static'");
-    root.join(POINT_CLOUD_FOLDER).is_dir() && names_network && !is_still && !has_network(root)
+    root.join(POINT_CLOUD_FOLDER).is_dir() && names_network && !is_still
 }
 
 /// Returns the names of the tensors in the network of the largest iteration; empty if the file cannot be read. Opening

@@ -11,7 +11,7 @@ mod screw;
 
 use glam::{DMat3, DVec3};
 
-use super::deform_folder::{DeformFolder, ModelParts, NetworkMotionModel, has_network, lacks_network};
+use super::deform_folder::{DeformFolder, ModelParts, NetworkMotionModel, has_network, needs_network};
 use crate::deform::{EncodedPositions, Network, PredictedMotion};
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
@@ -21,7 +21,7 @@ use crate::models::motion_model::{MotionModel, copy_stored};
 /// Model format of Deformable-3D-Gaussians: recognizes and opens a model folder. Also recognizes a folder without the
 /// network, of this trainer or of SC-GS, so that opening it names the missing folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    recognizes: |found| found.is_folder && (has_network(found.path) || lacks_network(found.path)),
+    recognizes: |found| found.is_folder && (has_network(found.path) || needs_network(found.path)),
     open: |path, options| DeformFolder::open(path, options, &ENTRY, DeformableMotion::new),
 };
 

@@ -245,10 +245,8 @@ impl QualityStage {
             (None, Some(PreparedArchive::Frames(_))) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
-        let before_conversion = match self.kind.motion_note(times.len()) {
-            Some(_) => true,
-            None => written.is_none() && self.kind.fidelity() != Fidelity::Exact,
-        };
+        let is_converted = self.kind.fidelity() != Fidelity::Exact || self.kind.motion_note(times.len()).is_some();
+        let before_conversion = written.is_none() && is_converted;
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
             let psnr = journal.result_psnr().unwrap_or(refined.result);
             let views = refined.views;

@@ -230,13 +230,12 @@ pub(crate) fn check_met(
 ) -> Result<Option<String>> {
     let required_psnr = quality_target.required_psnr(summary.level);
     let shortfall = match quality_target {
-        QualityTarget::Bytes(_) => 0.0,
-        _ if summary.is_refined => 0.0,
+        QualityTarget::Bytes(_) => return Ok(None),
+        _ if summary.is_refined => return Ok(None),
         QualityTarget::Close(_) => required_psnr - summary.psnr,
         QualityTarget::Loss(most) => summary.loss - most,
     };
-    let is_checked = !summary.is_refined && !matches!(quality_target, QualityTarget::Bytes(_));
-    let fails = is_checked && summary.psnr < required_psnr.min(ENOUGH_PSNR) - MAX_SHORTFALL;
+    let fails = summary.psnr < required_psnr.min(ENOUGH_PSNR) - MAX_SHORTFALL;
     if !fails && shortfall <= NOTED_SHORTFALL {
         return Ok(None);
     }

@@ -95,8 +95,8 @@ impl Stage for ShrinkToBytes {
 struct Sample<'a> {
     /// Ids of all Gaussians that an output can hold, increasing.
     ids: &'a [u32],
-    /// Gaussian that is in every sample: the best one of the ranking, for an output that cannot hold only Gaussians that
-    /// are never visible; `None` for other outputs.
+    /// Gaussian that every sample contains: the first one of the ranking, which is visible. `None` for outputs that may
+    /// consist of invisible Gaussians only.
     best: Option<u32>,
 }
 
