@@ -23,6 +23,13 @@ const WARM_UP_STEPS: usize = 10;
 /// root mean square errors of the views, with color values from 0 to 1.
 const FULL_ERROR: f64 = 0.036;
 
+/// Learning rate of the position of a Gaussian, divided by the geometric mean of its scales.
+const POSITION_RATE: f32 = 0.04;
+/// Largest scale that counts for the learning rate of a position, divided by the median scale of all Gaussians. A
+/// Gaussian that encloses the scene, such as haze or a sky, would otherwise cross the scene in one step and change the
+/// order in which Gaussians are blended. In trained scenes without such Gaussians the ratio is at most 360.
+const MAX_SCALE_RATIO: f32 = 400.0;
+
 /// Factor on all learning rates as a function of the optimization step.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct RateSchedule {
@@ -56,9 +63,9 @@ pub struct Adam {
     change: ParamDelta,
     /// Running mean of the derivatives, and running mean of the squared derivatives.
     means: [Gaussians; 2],
-    /// Two lists of factors on the learning rates, each with one factor per Gaussian. First list: factors for
-    /// positions, 0.04 · (geometric mean of the scales of the Gaussian), in scene units. Second list: factors for all
-    /// other attributes, 1. Both factors are 0 for Gaussians that are not optimized.
+    /// Two lists of factors on the learning rates, each with one factor per Gaussian. First list: factors for positions
+    /// ([`position_rates`]), in scene units. Second list: factors for all other attributes, 1. Both factors are 0 for
+    /// Gaussians that are not optimized.
     reach: [Vec<f32>; 2],
     columns: Attributes,
     done: usize,
@@ -78,10 +85,9 @@ impl Adam {
         for column in columns.iter() {
             *change.attribute_values_mut(column) = AttributeValues::zeros(column.width(sh_degree), start.len());
         }
-        let extent = |i: usize| start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0;
         let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
-        let position_reach = |(i, free): (usize, &f32)| free * 0.04 * extent(i).clamp(-80.0, 80.0).exp();
-        let reach = [free.iter().enumerate().map(position_reach).collect(), free];
+        let position_rates = position_rates(start).into_iter().zip(&free).map(|(rate, free)| free * rate).collect();
+        let reach = [position_rates, free];
         Adam { means: [change.clone(), change.clone()], change: ParamDelta(change), reach, columns, done: 0 }
     }
 
@@ -170,6 +176,17 @@ impl Adam {
     }
 }
 
+/// Returns the learning rate of the position of each Gaussian of `start`, scene units: [`POSITION_RATE`] times the
+/// geometric mean of its scales, which counts at most as [`MAX_SCALE_RATIO`] times the median of all Gaussians.
+fn position_rates(start: &Gaussians) -> Vec<f32> {
+    let scale = |i: usize| (start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0).clamp(-80.0, 80.0).exp();
+    let scales: Vec<f32> = (0..start.len()).map(scale).collect();
+    let mut sorted = scales.clone();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let largest = MAX_SCALE_RATIO * sorted.get(sorted.len() / 2).copied().unwrap_or_default();
+    scales.into_iter().map(|scale| POSITION_RATE * if scale > largest { largest } else { scale }).collect()
+}
+
 /// Returns the learning rate of component `c` of the attribute `column`. For positions it is 1, because `Adam::reach`
 /// contains their learning rate, which depends on the size of the Gaussian.
 fn rate(column: Attributes, c: usize) -> f32 {
@@ -186,6 +203,18 @@ fn rate(column: Attributes, c: usize) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn giant_gaussians_do_not_cross_the_scene() {
+        let mut start = Gaussians::zeros(101, 0);
+        start.log_scale.set_row(7, [1.0, 2.0, 3.0]);
+        start.log_scale.set_row(50, [12.0; 3]);
+        let rates = position_rates(&start);
+        assert_eq!(rates[0], POSITION_RATE);
+        assert!((rates[7] - POSITION_RATE * 2f32.exp()).abs() < 1e-6);
+        assert_eq!(rates[50], POSITION_RATE * MAX_SCALE_RATIO);
+        assert!(position_rates(&Gaussians::zeros(0, 0)).is_empty());
+    }
 
     /// Returns the derivatives of Σ (value − `aim`)² / 2 with respect to every attribute value of `state`.
     fn slopes(state: &Gaussians, aim: f32) -> Gradients {
