@@ -156,7 +156,7 @@ fn run_stages(
     plan.stages.run(Phase::Rank, &mut run)?;
     match &plan.search {
         Some(search) => search.run(&mut run)?,
-        None => plan.stages.run(Phase::Reduce, &mut run)?,
+        None => reduce(plan, &mut run)?,
     }
     let scored = run.scored()?;
     // An empty input may give an empty output; losing every Gaussian of a non-empty input is an error.
@@ -168,6 +168,23 @@ fn run_stages(
     run.journal.notes.extend(scene.work.take_notes());
     plan.stages.run(Phase::Write, &mut run)?;
     run.written.ok_or_else(|| Error::internal("no stage of the plan wrote a result"))
+}
+
+/// Runs the stages that reduce the model to the target. Repeats them as long as a stage asks for it, because the result
+/// is far from the requested size on disk. Of a reduction that is repeated, only the records of its stages are kept.
+fn reduce(plan: &RunPlan, run: &mut RunState<'_>) -> Result<()> {
+    loop {
+        let before = [run.journal.left_out.len(), run.journal.notes.len()];
+        run.must_repeat = false;
+        plan.stages.run(Phase::Reduce, run)?;
+        if !run.must_repeat {
+            return Ok(());
+        }
+        run.journal.left_out.truncate(before[0]);
+        run.journal.notes.truncate(before[1]);
+        (run.journal.field, run.journal.bands) = (None, None);
+        (run.journal.refined, run.journal.photographs) = (None, None);
+    }
 }
 
 /// Returns the text of the file `recipe.toml` that is written beside the result. `input_digest` is the digest of the

@@ -296,12 +296,6 @@ impl Scored {
         self.protected.binary_search(&id).is_ok()
     }
 
-    /// Returns the ids of all Gaussians except those dropped because a value is not finite ([`Scored::absent`]),
-    /// increasing.
-    pub fn present_ids(&self) -> Vec<u32> {
-        (0..self.gaussian_count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
-    }
-
     /// Returns the statistics of every Gaussian; reads them back first if they are in the scratch file.
     ///
     /// # Errors

@@ -17,10 +17,11 @@ fn with_demo() -> Workplace {
 const QUICKLY: &str =
     "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_steps_per_prune=20";
 
-/// Returns the total number of bytes of all files below the output folder, or of the output file and the files beside
-/// it that begin with its name.
+/// Returns the number of bytes of the output file, or of all files of the output folder except the recipe, the index
+/// map and the summary.
 fn bytes_written(workplace: &Workplace, output: &str) -> u64 {
-    let belongs = |name: &Path| name.starts_with(output) || name.to_string_lossy().starts_with(&format!("{output}."));
+    let companions = ["recipe.toml", "index_map.npy", "summary.json"].map(|name| Path::new(output).join(name));
+    let belongs = |name: &Path| name.starts_with(output) && !companions.iter().any(|companion| companion == name);
     files(&workplace.path("")).into_iter().filter(|(name, _)| belongs(name)).map(|(_, bytes)| bytes.len() as u64).sum()
 }
 
@@ -84,23 +85,25 @@ fn output_size_is_just_below_the_target() {
     let workplace = with_demo();
     let model = "{tiny} --cameras {tiny} --set refine_steps=40 --set refine_steps_per_prune=10";
     for (how, output, most) in
-        [(QUICKLY, "small.gseq", 90_000u64), (QUICKLY, "frames", 400_000), (model, "model", 110_000)]
+        [(QUICKLY, "small.gseq", 40_000u64), (QUICKLY, "frames", 300_000), (model, "model", 90_000)]
     {
         let kind = if output == "frames" { "--as ply-sequence" } else { "" };
         let summary = workplace.summary(&format!("{how} --size {most}B {kind} -o {output}"));
         let written = bytes_written(&workplace, output);
-        assert!(written <= most && written > most * 9 / 10 - 24_576, "{output}: {written} of {most}, {summary}");
+        assert_eq!(summary["output_bytes"].as_u64(), Some(written), "{summary}");
+        // What refined values take is known only after refinement, which is repeated twice at most.
+        assert!(written <= most && written > most * 4 / 5, "{output}: {written} of {most}, {summary}");
         assert!(summary["gaussians"].as_u64().unwrap() > 30, "{summary}");
     }
-    workplace.refused(2, &format!("compress {QUICKLY} --size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
+    workplace.refused(2, &format!("compress {QUICKLY} --size 200B -o none.gseq"), &["one Gaussian", "200"]);
 }
 
 #[test]
 fn sizes_that_are_too_small_are_explained() {
     let workplace = Workplace::new();
     let line = "compress {tiny} --no-refine -o small.gseq --size";
-    let parts = ["expected at least ", "found 10000", "one Gaussian: ", "index map with 8 bytes for each Gaussian"];
-    workplace.refused(2, &format!("{line} 10KB"), &parts);
+    let parts = ["expected at least ", "found 200", "one Gaussian; "];
+    workplace.refused(2, &format!("{line} 200B"), &parts);
     let parts = ["--size: ", " Gaussians fit the size, but 300 are to be kept"];
     workplace.refused(2, &format!("{line} 60KB --keep-box=-99,-99,-99,99,99,99"), &parts);
 }

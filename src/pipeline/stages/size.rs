@@ -1,6 +1,7 @@
 //! Two stages, both named `size`, of a run with a requested size on disk. The first stage finds how many Gaussians fit
-//! the size, before Gaussians are ranked. The second stage removes Gaussians from the result at the end, if the result
-//! exceeds the size because refined values compress worse than the values with which the number was found.
+//! the size, before Gaussians are refined. Refined values may take more or fewer bytes. The second stage therefore
+//! measures the result, and asks for a repetition of the reduction with another number of Gaussians if too many bytes
+//! are left or missing. Finally it removes Gaussians until the result fits.
 
 use std::num::NonZeroU32;
 
@@ -17,6 +18,7 @@ use crate::pipeline::stage::{ByteLimitFit, EstimateInput, Phase, RunState, Stage
 use crate::pipeline::stages::archive;
 use crate::pipeline::stages::field::FieldPrecisionStage;
 use crate::pipeline::stages::write::WriteStage;
+use crate::pruning::Ranking;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
 use crate::recipe::FieldPrecision;
@@ -30,6 +32,12 @@ const MAX_UNUSED: f64 = 0.01;
 /// Maximum number of trials in the search for the number of Gaussians that fits the byte limit. Each trial writes an
 /// output with one number of Gaussians and measures its bytes.
 const MAX_TRIED: usize = 8;
+/// Range of the bytes of a refined result, divided by the byte limit, within which its number of Gaussians is accepted.
+const ACCEPTED_BYTES: std::ops::RangeInclusive<f64> = 0.9..=1.02;
+/// Fraction of the byte limit that a repetition of the reduction aims at.
+const REPEATED_AIM: f64 = 0.97;
+/// Maximum number of repetitions of the reduction with another number of Gaussians.
+const MAX_REPEATS: usize = 2;
 /// Number of views by which Gaussians are ranked to remove some of them, if the result exceeds the requested size on
 /// disk.
 const RANKING_VIEWS: usize = 48;
@@ -45,7 +53,11 @@ pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
 /// requested. An archive needs no such stage, because its quantization steps are adapted to the size.
 pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
-        stages.add(Phase::Reduce, ShrinkToBytes { limit });
+        let repeats = planning.refine.is_some();
+        if repeats {
+            stages.set_uncertain_duration();
+        }
+        stages.add(Phase::Reduce, ShrinkToBytes { limit, repeats });
     }
 }
 
@@ -65,18 +77,21 @@ impl Stage for CountByBytes {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let template = CompressedModel { field: self.limit.field, ..run.template.clone() };
-        let (scored, recipe) = (run.scored()?, run.recipe.len() as u64);
-        run.counts_within_bytes =
-            self.limit.fits(run.scene, (&scored, recipe), &template, self.drops_bands, &mut run.journal)?;
+        let scored = run.scored()?;
+        let ranking = &scored.selection.ranking;
+        run.counts_within_bytes = self.limit.fits(run.scene, ranking, &template, self.drops_bands, &mut run.journal)?;
         run.target = run.counts_within_bytes.first().map(|fit| fit.gaussians);
         Ok(())
     }
 }
 
-/// Stage that removes Gaussians from a result whose files exceed the requested size on disk.
+/// Stage that removes Gaussians from a result whose files exceed the requested size on disk, or asks for a repetition
+/// with another number of Gaussians.
 #[derive(Debug)]
 struct ShrinkToBytes {
     limit: ByteLimit,
+    /// Whether the reduction may be repeated. Without refinement, values take the bytes that were measured before.
+    repeats: bool,
 }
 
 impl Stage for ShrinkToBytes {
@@ -85,61 +100,34 @@ impl Stage for ShrinkToBytes {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        let (scored, result, recipe) = (run.scored()?, run.take_result(), run.recipe.len() as u64);
-        run.result = self.limit.shrink(run.scene, &scored, result, recipe, &mut run.journal)?;
+        let (scored, result) = (run.scored()?, run.take_result());
+        let most = (self.repeats && run.repeats < MAX_REPEATS).then(|| scored.selection.ranking.order().len());
+        let (result, next) = self.limit.shrink(run.scene, &scored, result, most, &mut run.journal)?;
+        run.result = result;
+        if let Some(next) = next {
+            run.repeats += 1;
+            (run.target, run.must_repeat) = (Some(next), true);
+        }
         Ok(())
     }
 }
 
-/// Gaussians of which samples are written to measure the size of outputs.
-struct Sample<'a> {
-    /// Ids of all Gaussians that an output can hold, increasing.
-    ids: &'a [u32],
-    /// Gaussian that every sample contains: the first one of the ranking, which is visible. `None` for outputs that may
-    /// consist of invisible Gaussians only.
-    best: Option<u32>,
-}
-
-impl Sample<'_> {
-    /// Returns `count` of the Gaussians, evenly spaced, in increasing order. If `best` is not among them, it replaces
-    /// the first.
-    fn pick(&self, count: usize) -> Vec<u32> {
-        let mut kept: Vec<u32> = (0..count).map(|k| self.ids[k * self.ids.len() / count]).collect();
-        let best = self.best.filter(|best| kept.binary_search(best).is_err());
-        if let (Some(first), Some(best)) = (kept.first_mut(), best) {
-            *first = best;
-            kept.sort_unstable();
-        }
-        kept
-    }
-}
-
-/// Returns the error for a size on disk of `most` bytes, which not even one Gaussian fits. An output with one Gaussian
-/// takes `least` bytes, of which `beside` are those of the files beside it.
-fn too_few_bytes(least: u64, beside: u64, most: u64) -> Error {
-    let written = least - beside;
-    let (parts, advice) = match beside {
-        0 => ("; nearly all of it is data other than Gaussians, such as a deformation network".to_owned(), ""),
-        _ => (
-            format!(
-                ": {written} bytes of its file or folder, with the deformation network if the model has one, and \
-                 {beside} of the files beside it (index map with 8 bytes for each Gaussian of the input, recipe, summary)"
-            ),
-            ", or write an archive (NAME.gsz): the files beside it do not count",
-        ),
-    };
+/// Returns the error for a size on disk of `most` bytes, which is less than the `least` bytes of an output with one
+/// Gaussian.
+fn too_few_bytes(least: u64, most: u64) -> Error {
     Error::usage(format!(
         "--size: expected at least {least} bytes, found {most}\n  {least} bytes is the size of an output with one \
-         Gaussian{parts}\n  ask for more bytes{advice}"
+         Gaussian; nearly all of it is data other than Gaussians, such as a deformation network\n  ask for more bytes"
     ))
 }
 
-/// Limit on the bytes of all output files together.
+/// Limit on the bytes of the output file, or of all files of the output folder. The files beside it (recipe, index map,
+/// summary) do not count: they are not sent with a model.
 #[derive(Debug, Clone)]
 struct ByteLimit {
     /// Stage that writes the output files; used to measure the size of a result.
     writer: WriteStage,
-    /// Maximum number of bytes of all output files together.
+    /// Maximum number of bytes of the output.
     most: u64,
     /// Precision of the deformation field that is assumed when sizes are measured: half precision if the recipe allows
     /// it.
@@ -154,77 +142,69 @@ impl ByteLimit {
         Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
-    /// Returns how many of the Gaussians in `scored` fit the byte limit ([`ByteLimit::count`]), for one or more SH
-    /// degrees:
+    /// Returns how many Gaussians of `ranking` fit the byte limit ([`ByteLimit::count`]), for one or more SH degrees:
     /// - if `drops` is false, for the degree of `template` only;
     /// - if `drops` is true, also for lower degrees in decreasing order, up to the first degree at which all Gaussians
     ///   fit.
     ///
-    /// `template` holds the other settings of the model. `recipe`: size of the recipe file, bytes.
+    /// `template` holds the other settings of the model.
     ///
     /// # Errors
     /// Fails in the cases in which [`ByteLimit::count`] fails.
     fn fits(
         &self,
         scene: &Scene,
-        (scored, recipe): (&Scored, u64),
+        ranking: &Ranking,
         template: &CompressedModel,
         drops: bool,
         journal: &mut Journal,
     ) -> Result<Vec<ByteLimitFit>> {
-        let info = scene.source().info();
-        let highest = template.sh_degree.min(info.sh_degree);
+        let highest = template.sh_degree.min(scene.source().info().sh_degree);
         let lowest = if drops && scene.input.reason_to_keep_sh_degree().is_none() { 0 } else { highest };
-        let present = scored.present_ids();
-        let needs_visible = self.writer.kind == OutputKind::Tsog;
-        let best = scored.selection.ranking.order().first().copied().filter(|_| needs_visible);
-        let sample = Sample { ids: &present, best };
         let mut fits: Vec<ByteLimitFit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
-            if fits.last().is_some_and(|fit| fit.gaussians == present.len()) {
+            if fits.last().is_some_and(|fit| fit.gaussians == ranking.order().len()) {
                 break;
             }
             let template = CompressedModel { sh_degree, ..template.clone() };
-            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (&sample, recipe), &template, journal)? });
+            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, ranking, &template, journal)? });
         }
         Ok(fits)
     }
 
-    /// Returns the cache key of everything on which the size of an output with the model `compressed` depends. `recipe`
-    /// is the size of the recipe file beside the result, bytes.
-    fn key(&self, scene: &Scene, recipe: u64, compressed: &CompressedModel) -> CacheKey {
-        scene.work.key(&(self.writer.kind, self.writer.merges, self.most, recipe, compressed))
+    /// Returns the cache key of everything on which the size of an output with the model `compressed` depends.
+    fn key(&self, scene: &Scene, compressed: &CompressedModel) -> CacheKey {
+        scene.work.key(&(self.writer.kind, self.writer.merges, self.most, compressed))
     }
 
-    /// Returns how many Gaussians an output within the byte limit can hold. Sizes are measured on evenly spaced samples
-    /// of the Gaussians in `sample`. `template` holds the other settings of the model, such as the SH degree; `recipe`
-    /// is the size of the recipe file, bytes.
+    /// Returns how many Gaussians an output within the byte limit can hold. Sizes are measured with the first Gaussians
+    /// of `ranking`, because the bytes of a Gaussian may depend on its motion and life span, which differ between
+    /// Gaussians that stay and those that are removed. `template` holds the other settings of the model, such as the SH
+    /// degree.
     ///
     /// # Errors
     /// Fails if not even one Gaussian fits, if frames cannot be read, or if a write fails.
     fn count(
         &self,
         scene: &Scene,
-        (sample, recipe): (&Sample<'_>, u64),
+        ranking: &Ranking,
         template: &CompressedModel,
         journal: &mut Journal,
     ) -> Result<usize> {
-        let (all, most) = (sample.ids.len(), self.most);
-        let beside = self.writer.companion_bytes(scene, recipe);
-        let key = self.key(scene, recipe, template).extended_by(&sample.best);
+        let (all, most) = (ranking.order().len(), self.most);
+        let key = self.key(scene, template).extended_by(ranking);
         journal.run_cached_stage(NAME, all, scene, key, |_| {
             let bytes = |count: usize| {
-                let some = template.with_kept(sample.pick(count));
-                let written = match self.writer.kind {
-                    OutputKind::Archive => archive::estimated_bytes(scene, &some)?,
-                    _ => self.writer.output_bytes(scene, &some)?,
-                };
-                Ok::<u64, Error>(written + beside)
+                let some = template.with_kept(ranking.best_ids(count));
+                match self.writer.kind {
+                    OutputKind::Archive => archive::estimated_bytes(scene, &some),
+                    _ => self.writer.output_bytes(scene, &some),
+                }
             };
             let one = 1.min(all);
             let least = bytes(one)?;
             if least > most {
-                return Err(too_few_bytes(least, beside, most));
+                return Err(too_few_bytes(least, most));
             }
             // Numbers of Gaussians with their bytes: `fits` is the largest number that fits, `over` the smallest that
             // does not.
@@ -253,7 +233,10 @@ impl ByteLimit {
     /// Removes the Gaussians with the lowest removal error (squared error of renders caused by removing one) from
     /// `compressed` until the output fits the byte limit, and returns the smaller model. This is needed if refined
     /// values compress worse than the values with which the number of Gaussians was found. Gaussians that must stay are
-    /// not removed. `recipe` is the size of the recipe file, bytes.
+    /// not removed.
+    ///
+    /// If the bytes are far from the limit ([`ACCEPTED_BYTES`]) and the reduction may be repeated with up to `most`
+    /// Gaussians, returns `compressed` as it is, and the number of Gaussians for the repetition.
     ///
     /// # Errors
     /// Fails if the Gaussians that must stay do not fit alone, if frames cannot be read, or if a write fails.
@@ -262,22 +245,26 @@ impl ByteLimit {
         scene: &Scene,
         scored: &Scored,
         mut compressed: CompressedModel,
-        recipe: u64,
+        most: Option<usize>,
         journal: &mut Journal,
-    ) -> Result<CompressedModel> {
-        let key = self.key(scene, recipe, &compressed).extended_by(&scored.protected);
+    ) -> Result<(CompressedModel, Option<usize>)> {
+        let key = self.key(scene, &compressed).extended_by(&(&scored.protected, most));
         journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
-            let beside = self.writer.companion_bytes(scene, recipe);
-            let bytes = |some: &CompressedModel| Ok::<u64, Error>(self.writer.output_bytes(scene, some)? + beside);
+            let bytes = |some: &CompressedModel| self.writer.output_bytes(scene, some);
             let empty = bytes(&compressed.pick(&[]))?;
-            let mut tried = 0;
+            let (mut tried, protected) = (0, scored.protected.len());
             loop {
-                let found = bytes(&compressed)?;
-                if found <= self.most {
-                    let count = compressed.len();
-                    return Ok((compressed, count));
+                let (count, found) = (compressed.len(), bytes(&compressed)?);
+                if let Some(most) = most.filter(|_| tried == 0) {
+                    let next = self.repeated_count(count, found, empty).clamp(protected.max(1).min(most), most);
+                    let is_accepted = ACCEPTED_BYTES.contains(&(found as f64 / self.most.max(1) as f64));
+                    if !is_accepted && next != count {
+                        return Ok(((compressed, Some(next)), count));
+                    }
                 }
-                let protected = scored.protected.len();
+                if found <= self.most {
+                    return Ok(((compressed, None), count));
+                }
                 if compressed.len() <= protected {
                     return Err(Error::usage(format!(
                         "--size: expected at least {found} bytes, the size of an output with only the \
@@ -292,6 +279,13 @@ impl ByteLimit {
                 compressed = compressed.pick(&places);
             }
         })
+    }
+
+    /// Returns the number of Gaussians with which the output is expected to take the fraction [`REPEATED_AIM`] of the
+    /// byte limit, if it takes `found` bytes with `count` Gaussians and `empty` bytes without any.
+    fn repeated_count(&self, count: usize, found: u64, empty: u64) -> usize {
+        let wanted = REPEATED_AIM * self.most as f64 - empty as f64;
+        (wanted / found.saturating_sub(empty).max(1) as f64 * count as f64) as usize
     }
 
     /// Chooses the `count` Gaussians of `compressed` that stay: those that must stay, then those with the highest
@@ -322,18 +316,6 @@ fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_sample_holds_the_best_gaussian_and_is_increasing() {
-        let ids = [2, 3, 5, 8, 13, 21];
-        let picked = |best, count| Sample { ids: &ids, best }.pick(count);
-        assert_eq!(picked(None, 3), [2, 5, 13]);
-        assert_eq!(picked(Some(8), 1), [8]);
-        assert_eq!(picked(Some(8), 3), [5, 8, 13]);
-        assert_eq!(picked(Some(5), 3), [2, 5, 13]);
-        assert_eq!(picked(Some(8), 6), ids);
-        assert!(picked(Some(8), 0).is_empty());
-    }
 
     #[test]
     fn shrinking_ends_whatever_the_bytes_are() {

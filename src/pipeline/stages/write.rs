@@ -41,10 +41,6 @@ const USUAL_LEFT: f64 = 0.5;
 /// Processor time of encoding and writing one Gaussian at one frame, seconds (`benches/pack.rs`).
 pub const ENCODE_SECONDS_PER_STATE: f64 = 3.5e-7;
 
-/// Assumed maximum total number of bytes of two things: the summary file, and the header of the index map. Long lists
-/// of files or notes may exceed it.
-const MAX_SUMMARY_BYTES: u64 = 16 << 10;
-
 /// Name of the file, beside every result, that holds all parameters of its run.
 pub const RECIPE_FILE: &str = "recipe.toml";
 /// Name of the file, beside every result, that holds for every input Gaussian its index in the output.
@@ -271,16 +267,6 @@ impl WriteStage {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
         write_without_companions(&*scene.input, compressed, self.kind, &path, &scene.limits, &scene.events)
-    }
-
-    /// Returns the total size in bytes of the files beside the output (recipe, index map, summary), or 0 for an
-    /// archive: they are neither stored nor sent with it, so they do not count. `recipe` is the size of the recipe file
-    /// in bytes; for the summary, an assumed maximum size is counted.
-    pub fn companion_bytes(&self, scene: &Scene, recipe: u64) -> u64 {
-        match self.kind {
-            OutputKind::Archive => 0,
-            _ => MAX_SUMMARY_BYTES + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64,
-        }
     }
 
     /// Writes the result and the files beside it (recipe, index map, summary) under temporary names, and renames them
