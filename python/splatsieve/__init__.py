@@ -65,11 +65,13 @@ def stream(
     may have any number of Gaussians, every frame has all columns, and the program links the Gaussians of consecutive
     frames. `constant` gives, by name, the columns (attributes) that are the same in all frames; the other columns come
     with every frame: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs; opacity_logit [N] or
-    [N, 1]; sh [N, (d+1)^2, 3]. At the end of the `with` block the program finishes its work, and `summary` holds the
-    summary of `compress`. If the block raises an exception, the program learns that the stream is incomplete and writes
-    nothing. `command` is "compress" or "convert". Options are those of `splatsieve compress --help`.
+    [N, 1]; sh [N, (d+1)^2, 3] or [N, 3 (d+1)^2]. At the end of the `with` block the program finishes its work, and
+    `summary` holds the summary of `compress`. If the block raises an exception, the program learns that the stream is
+    incomplete and writes nothing. `command` is "compress" or "convert". Options are those of
+    `splatsieve compress --help`.
 
-    Raises Error with the program's message, also from `frame` after the program has ended.
+    Raises ValueError, also from `frame`, if a column has an unknown name or a wrong shape, and Error with the program's
+    message, also from `frame` after the program has ended.
     """
     from ._stream import Stream
 

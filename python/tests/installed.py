@@ -124,6 +124,12 @@ class Installed(unittest.TestCase):
                 raise ZeroDivisionError("exporter")
         self.assertFalse((self.at / "f.gseq").exists())
 
+    def test_a_wrong_shape_is_refused_before_the_program_starts(self):
+        columns = self.columns(200)
+        columns["position"] = columns["position"].T
+        with self.assertRaisesRegex(ValueError, r"position has shape \[3, 200\], expected \[200, 3\]"):
+            splatsieve.stream(self.at / "w.gseq", 200, 0, columns)
+
     def test_a_refused_stream_raises_the_message(self):
         with self.assertRaisesRegex(splatsieve.Error, "frame 1.*above 1"):
             with splatsieve.stream(self.at / "t.gseq", 200, 0, self.columns(200), command="convert") as out:

@@ -133,6 +133,62 @@ fn failing_exporter_writes_no_end_mark() {
     assert!(message.contains("after 1 complete frame, without its end mark"), "{message}");
 }
 
+/// Checks that the writer names the attribute, the expected shape and the found shape before it writes anything.
+#[test]
+#[ignore = "needs numpy"]
+fn stream_writer_refuses_wrong_shapes_and_names() {
+    let code = r#"
+import io, re, sys; sys.path.insert(0, sys.argv[1])
+import numpy as np
+from stream_writer import StreamWriter
+
+widths = dict(position=(3,), rotation=(4,), log_scale=(3,), opacity_logit=(1,), sh=(4, 3))
+good = lambda n: {name: np.zeros((n, *width)) for name, width in widths.items()}
+
+def refused(words, count, degree, constant, frame):
+    out = io.BytesIO()
+    written = 0
+    try:
+        writer = StreamWriter(out, count, degree, constant)
+        written = out.tell()
+        writer.frame(0.0, frame)
+    except ValueError as error:
+        assert str(error) == words, error
+        assert out.tell() == written
+    else:
+        raise AssertionError(f"accepted: {words}")
+
+def frame(**changed):
+    return good(7) | changed
+
+refused("frame 0: position has shape [3, 7], expected [7, 3]", 7, 1, None, frame(position=np.zeros((3, 7))))
+refused("frame 0: position has shape [3, 7], expected [N, 3]", None, 1, None, frame(position=np.zeros((3, 7))))
+refused("frame 0: rotation has shape [6, 4], expected [7, 4]", None, 1, None, frame(rotation=np.zeros((6, 4))))
+opacity = np.zeros((1, 7))
+refused("frame 0: opacity_logit has shape [1, 7], expected [7] or [7, 1]", 7, 1, None, frame(opacity_logit=opacity))
+refused("frame 0: sh has shape [7, 4, 3], expected [7, 9, 3] or [7, 27]", 7, 2, None, frame())
+refused("frame 0: position has shape [7, 3], expected [8, 3]", 8, 1, None, frame())
+refused("frame 0: log_scale has shape [], expected [7, 3]", 7, 1, None, frame(log_scale=1.0))
+constant = dict(sh=np.zeros((3, 4, 7)))
+refused("constant columns: sh has shape [3, 4, 7], expected [7, 4, 3] or [7, 12]", 7, 1, constant, {})
+names = "position, rotation, log_scale, opacity_logit, sh"
+refused(f"frame 0: no attribute is named 'color', expected {names}", 7, 1, None, frame(color=np.zeros((7, 3))))
+refused(f"constant columns: no attribute is named 'scale', expected {names}", 7, 1, dict(scale=np.zeros((7, 3))), {})
+missing = frame(); del missing["rotation"]
+refused(f"frame 0: no rotation; each frame has {names}", 7, 1, None, missing)
+refused("frame 0: sh was given as constant, so no frame may have it", 7, 1, dict(sh=good(7)["sh"]), frame())
+refused("sh_degree is 4, expected 0, 1, 2 or 3", 7, 4, None, frame())
+refused("count is -1, expected a number of Gaussians from 0 to 2^32 - 1", -1, 1, None, frame())
+
+flat, full = io.BytesIO(), io.BytesIO()
+sh = np.arange(7 * 12.0).reshape(7, 4, 3)
+StreamWriter(full, 7, 1, None).frame(0.0, frame(sh=sh))
+StreamWriter(flat, 7, 1, None).frame(0.0, frame(sh=sh.reshape(7, 12), opacity_logit=np.zeros(7)))
+assert flat.getvalue() == full.getvalue()
+"#;
+    run(Command::new(python("numpy")).args(["-c", code]).arg(script("")), &Workplace::new());
+}
+
 #[test]
 #[ignore = "needs numpy"]
 fn stream_without_gaussians_is_written_and_read() {
