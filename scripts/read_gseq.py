@@ -10,7 +10,7 @@
     python3 scripts/read_gseq.py scene.gseq arrays.npz         # every frame of every column: times, and [T, N, width]
 
 Tiles are found through the index in the footer; one frame block of one column is in memory at a time. Checksums are not
-verified (`splatsieve verify` does that). Needs numpy and zstandard.
+verified (`splatsieve info --check` does that). Needs numpy and zstandard.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)

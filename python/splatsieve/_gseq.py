@@ -1,7 +1,7 @@
 """Reads gseq containers (format/SPEC.md) in numpy.
 
 Tiles are found through the index in the footer; one frame block of one column is in memory at a time. Checksums are not
-verified (`splatsieve verify` does that). Needs numpy and zstandard.
+verified (`splatsieve info --check` does that). Needs numpy and zstandard.
 """
 
 from __future__ import annotations
@@ -47,7 +47,12 @@ class Gseq:
         self.kept: dict[str, tuple[int, list[Array]]] = {}
 
     def column(self, name: str, frame: int) -> Array:
-        """Returns the values of the column `name` at frame number `frame`, shape [N, width]."""
+        """Returns the values of the column `name` at frame number `frame`, from 0, shape [N, width].
+
+        Raises IndexError if the container has no such frame.
+        """
+        if not 0 <= frame < len(self.times):
+            raise IndexError(f"no frame {frame}: the container has {len(self.times)} frames, counted from 0")
         block = frame // self.frame_block
         if self.kept.get(name, (None,))[0] != block:
             self.kept[name] = (block, [self.tile(name, i, block) for i in range(self.blocks)])

@@ -244,6 +244,21 @@ fn python_container_reader_returns_every_bit() {
     }
 }
 
+#[test]
+#[ignore = "needs numpy and zstandard"]
+fn python_container_reader_refuses_frames_outside() {
+    let workplace = Workplace::new();
+    workplace.done("convert {tiny} tiny.gseq --frames 3");
+    let check = "import sys; sys.path.insert(0, sys.argv[1])\n\
+         from read_gseq import Gseq\n\
+         for frame in (-1, 3):\n    \
+             try: Gseq('tiny.gseq').column('position', frame)\n    \
+             except IndexError as error: print(error)";
+    let said = run(Command::new(python("numpy, zstandard")).args(["-c", check]).arg(script("")), &workplace);
+    let expected = [-1, 3].map(|frame| format!("no frame {frame}: the container has 3 frames, counted from 0\n"));
+    assert_eq!(String::from_utf8(said).unwrap(), expected.concat());
+}
+
 /// Replacements for the classes of the 4DGaussians repository, with their names, signatures and printed output, because
 /// the real classes need its CUDA extensions. The deformation adds the time to positions.
 const REPOSITORY: [(&str, &str); 3] = [
