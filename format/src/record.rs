@@ -262,7 +262,10 @@ pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER_BYTES as usize], offset: u
             "the trailer of a finished container",
             "something else: the file is cut short or damaged",
         );
-        return Err(fault.hint("`recover` saves its complete frame blocks"));
+        return Err(fault.hint(
+            "to save its complete frames: `splatsieve info NAME.gseq --repair saved.gseq` (`gseq::recover` in the \
+             library)",
+        ));
     }
     Ok(footer)
 }

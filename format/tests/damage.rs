@@ -128,7 +128,8 @@ fn file_of_a_killed_writer_is_recovered() {
     scene.fill(&mut writer, Compression::Zstd(1), |_| ());
     std::mem::forget(writer);
     let left = fs::read_dir(folder.path()).unwrap().next().unwrap().unwrap().path();
-    assert!(Reader::open(&left).err().unwrap().to_string().contains("`recover` saves"));
+    let error = Reader::open(&left).err().unwrap().to_string();
+    assert!(error.contains("`splatsieve info NAME.gseq --repair saved.gseq` (`gseq::recover`"), "{error}");
     let saved = folder.path().join("saved");
     assert_eq!(recover(&left, &saved).unwrap().frames, 5);
     scene.compare(&Reader::open(&saved).unwrap(), 5).unwrap();
