@@ -61,7 +61,11 @@ pre {{ background: #8882; padding: .7em; white-space: pre-wrap; overflow-wrap: a
 def scenes(path):
     """Returns the checked words of every scene of a list."""
     outputs, listed = {}, []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        sys.exit(f"cannot read the list of scenes {path}: {getattr(error, 'strerror', None) or error}")
+    for number, line in enumerate(lines, 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
@@ -70,6 +74,9 @@ def scenes(path):
             sys.exit(f"{path}, line {number}: {error}")
         if len(words) < 3:
             sys.exit(f"{path}, line {number}: expected INPUT CAMERAS OUTPUT [OPTION ...], found {len(words)} words")
+        # The script sets the cache; the other two write no result.
+        if taken := [word for word in words[3:] if word.split("=")[0] in ("--cache", "--shard", "--dry-run")]:
+            sys.exit(f"{path}, line {number}: {taken[0].split('=')[0]} cannot be an option of a scene here; remove it")
         output = os.path.normpath(path.parent / words[2])
         if output in outputs:
             sys.exit(f"{path}, lines {outputs[output]} and {number}: both write {output}")
@@ -120,9 +127,17 @@ def compress(folder, run, scene):
     return [run["program"], "compress", source, *cameras, "-o", output, *options, "--cache", str(folder / "work" / scene["name"])]
 
 
+def scenes_of(folder):
+    """Returns the content of scenes.json of a folder."""
+    run = read(folder / "scenes.json")
+    if not run:
+        sys.exit(f"{folder}: expected a folder made from a list (LIST.run), found no scenes.json in it")
+    return run
+
+
 def task(folder, number, threads, memory):
     """Compresses a scene. Returns the exit status."""
-    run = read(folder / "scenes.json")
+    run = scenes_of(folder)
     if not 1 <= number <= len(run["scenes"]):
         sys.exit(f"{folder} has scenes 1 to {len(run['scenes'])}, and no {number}")
     scene = run["scenes"][number - 1]
@@ -175,20 +190,32 @@ def task(folder, number, threads, memory):
 
 
 def quality(summary):
-    """Returns in words how close the renders are to those of the original, if the run measured that."""
-    goal, archive, bands, field = (summary.get(key) or {} for key in ("goal", "archive", "bands", "field"))
+    """Returns in words how close the renders are to those of the original, and what a search for a quality reached."""
+    goal, measured, archive = (summary.get(key) or {} for key in ("goal", "quality", "archive"))
+    said = []
+    if measured:
+        ssim = f", {measured['ssim']:.3f} SSIM" if measured.get("ssim") is not None else ""
+        views = f"{measured['views']} {measured['kind']} views"
+        views += ", before conversion" if measured.get("before_conversion") else ""
+        said.append(f"{decibels(measured['psnr'])} PSNR{ssim} vs. original ({views})")
+    elif archive:
+        # An archive of frames, which was measured when its error bounds were chosen.
+        psnr = archive["level"] - archive["loss"]
+        said.append(f"{decibels(psnr)} PSNR vs. original (views that chose its precision)")
     if goal:
-        what = {"max_loss": "lost against the photographs"}.get(goal["name"], "to the original")
-        return f"{goal['searched']:.1f} dB {what}, {goal['asked']:g} asked for"
-    for psnr in (archive.get("level", 0) - archive.get("loss", 0), bands.get("result"), field.get("result")):
-        if psnr:
-            return f"{psnr:.1f} dB to the original"
-    return ""
+        what = {"max_loss": "loss against photographs"}.get(goal["name"], "PSNR vs. original")
+        said.append(f"{decibels(goal['searched'])} {what} on the views of the search, {goal['asked']:g} dB asked for")
+    return "; ".join(said)
+
+
+def decibels(value):
+    """Returns a number of a summary, null if it is not finite, with its unit."""
+    return "unknown" if value is None else f"{value:.2f} dB"
 
 
 def write_summary(folder):
     """Writes the summary of all scenes. Returns whether all are done."""
-    run = read(folder / "scenes.json")
+    run = scenes_of(folder)
     rows = []
     for scene in run["scenes"]:
         record = read(folder / "tasks" / f"{scene['name']}.json")

@@ -391,6 +391,54 @@ fn bars_fit_the_terminal_and_leave_no_line_behind() {
     assert_eq!(String::from_utf8(said).unwrap().matches("all fit").count(), 3);
 }
 
+/// Checks the summary of a list of scenes, without a scheduler, and the messages about lists that cannot be run.
+#[test]
+#[ignore = "needs Python"]
+fn many_scenes_are_summarized_with_their_quality() {
+    let workplace = Workplace::new();
+    workplace.done("test-scene --gaussians 300 --frames 4 -o demo");
+    let many = |arguments: &[&str]| {
+        let mut command = Command::new(python("json"));
+        command.arg(script("slurm/many_scenes.py")).args(arguments).current_dir(workplace.path(""));
+        command.output().unwrap()
+    };
+    let program = program();
+    let program = program.to_str().unwrap();
+    let scenes = "demo/scene.gseq demo/cameras.json a.gseq --no-refine --ratio 0.5\n\
+        demo/scene.gseq demo/cameras.json b.gsz --no-refine --min-psnr 30\n";
+    fs::write(workplace.path("list"), scenes).unwrap();
+    assert!(many(&["list", "--program", program]).status.success());
+    for number in ["1", "2"] {
+        let output = many(&["list.run", "--task", number]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    assert!(many(&["list.run", "--summary"]).status.success());
+    let table = fs::read_to_string(workplace.path("list.run/summary.csv")).unwrap();
+    let rows: Vec<_> = table.lines().collect();
+    let summary: serde_json::Value =
+        serde_json::from_slice(&fs::read(workplace.path("a.gseq.summary.json")).unwrap()).unwrap();
+    let psnr = summary["quality"]["psnr"].as_f64().unwrap();
+    assert!(rows[1].contains(&format!("{psnr:.2} dB PSNR, ")) && rows[1].contains(" SSIM vs. original ("), "{table}");
+    assert!(rows[2].contains(" dB PSNR vs. original on the views of the search, 30 dB asked for"), "{table}");
+
+    for (line, expected) in [
+        ("--dry-run", "list2, line 1: --dry-run cannot be an option of a scene here; remove it"),
+        ("--shard=1/2", "list2, line 1: --shard cannot be an option of a scene here; remove it"),
+    ] {
+        fs::write(workplace.path("list2"), format!("demo/scene.gseq - c.gseq {line}\n")).unwrap();
+        let output = many(&["list2", "--program", program]);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(message.trim_end().ends_with(expected) && message.lines().count() == 1, "{message}");
+    }
+    for (arguments, expected) in [
+        (vec!["none", "--program", program], "none: No such file or directory"),
+        (vec!["none.run", "--summary"], "expected a folder made from a list (LIST.run), found no scenes.json in it"),
+    ] {
+        let message = String::from_utf8(many(&arguments).stderr).unwrap();
+        assert!(message.trim_end().ends_with(expected) && message.lines().count() == 1, "{message}");
+    }
+}
+
 /// Runs the tests of the installed Python package: compressing, streams, containers and refusals.
 #[test]
 #[ignore = "needs maturin, numpy and zstandard"]
