@@ -21,7 +21,7 @@ Log = Callable[[str], object]
 
 # Options that can be given without a value; the other boolean options take `=true` and `=false`.
 SWITCHES = frozenset(
-    "all allow_gaps check clean dry_run explain flip json merge_only no_refine overwrite prune_only quiet raw "
+    "all allow_gaps check clean dry_run explain flip json merge_only no_refine overwrite path prune_only quiet raw "
     "render_time verbose view".split()
 )
 
@@ -52,7 +52,7 @@ def program() -> str:
 
 def flags(options: Mapping[str, Option]) -> list[str]:
     """Converts options to command-line arguments: `dry_run=True` to `--dry-run`, `keep_box=(0, 1)` to
-    `--keep-box=0,1`, `set={"mu": 2}` to `--set=mu=2`.
+    `--keep-box=0,1`, `set={"mu": 2}` to `--set=mu=2`. A list of lists repeats the option, also as a value in `set`.
     """
     words = []
     for key, value in options.items():
@@ -62,12 +62,17 @@ def flags(options: Mapping[str, Option]) -> list[str]:
         if value is True and key in SWITCHES:
             words.append(flag)
         elif key == "set" and isinstance(value, Mapping):
-            words += [f"{flag}={name}={text(one)}" for name, one in value.items()]
-        elif isinstance(value, (list, tuple)) and value and all(isinstance(one, (list, tuple)) for one in value):
-            words += [f"{flag}={text(one)}" for one in value]
+            words += [f"{flag}={name}={one}" for name, parameter in value.items() for one in texts(parameter)]
         else:
-            words.append(f"{flag}={text(value)}")
+            words += [f"{flag}={one}" for one in texts(value)]
     return words
+
+
+def texts(value: Option) -> list[str]:
+    """Returns the command-line texts of a value: one for each inner list of a list of lists, else one."""
+    if isinstance(value, (list, tuple)) and value and all(isinstance(one, (list, tuple)) for one in value):
+        return [text(one) for one in value]
+    return [text(value)]
 
 
 def text(value: Option) -> str:

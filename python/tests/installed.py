@@ -146,7 +146,7 @@ class Installed(unittest.TestCase):
         self.assertIn("compress", verbs)
         options = "".join(help(verb) for verb in verbs if verb != "help")
         # A name is followed by its value, by an optional value in brackets, or after two blanks by its description.
-        found = set(re.findall(r"^ {2,6}(?:-\w, )?--([\w-]+)(?:$|\[| {2,}\S)", options, re.M))
+        found = set(re.findall(r"^ {2,6}(?:-\w, )?--([\w-]+)(?:$| ?\[| {2,}\S)", options, re.M))
         self.assertEqual({name.replace("-", "_") for name in found} - {"help", "version"}, set(_program.SWITCHES))
 
     def test_options_become_command_line_words(self):
@@ -156,6 +156,10 @@ class Installed(unittest.TestCase):
         self.assertEqual(words, ["--keep-box=-1,0,1.5", "--max-error=position=0.001"])
         words = _program.flags({"set": {"choose_by_views": False, "refine_steps": 9}})
         self.assertEqual(words, ["--set=choose_by_views=false", "--set=refine_steps=9"])
+        words = _program.flags({"set": {"passes": [(0.005, 1, 0.95, 0.9), (0.01, 2, 0.9, 0.8)], "mu": 2}})
+        self.assertEqual(words, ["--set=passes=0.005,1,0.95,0.9", "--set=passes=0.01,2,0.9,0.8", "--set=mu=2"])
+        self.assertEqual(_program.flags({"path": True}), ["--path"])
+        self.assertEqual(_program.flags({"path": (0, 3)}), ["--path=0,3"])
         words = _program.flags({"set": [("passes=1", 2), ("passes=3", 4)]})
         self.assertEqual(words, ["--set=passes=1,2", "--set=passes=3,4"])
 

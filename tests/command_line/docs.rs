@@ -326,11 +326,12 @@ fn python_knows_the_options_that_need_no_value() {
     let mut taken = BTreeSet::new();
     for verb in COMMANDS {
         let help = workplace.done(&format!("{verb} --help"));
-        // A line of such an option is `--name`, `-n, --name` or `--name[=VALUE]`, and two spaces before a description.
+        // A line of such an option is `--name`, `-n, --name`, `--name[=VALUE]` or `--name [<VALUE>]`, and two spaces
+        // before a description.
         let options = help.lines().filter_map(|line| {
             let line = line.trim_start();
             let line = if line.get(2..4) == Some(", ") { &line[4..] } else { line };
-            line.strip_prefix("--")?.split("  ").next()?.split("[=").next()
+            line.strip_prefix("--")?.split("  ").next()?.split("[=").next()?.split(" [<").next()
         });
         let is_name = |text: &&str| text.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
         taken.extend(options.filter(is_name).map(|name| name.replace('-', "_")));
