@@ -13,7 +13,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::records::Forecast;
 use crate::journal::records::OmittedWork;
-use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload};
+use crate::memory_plan::{MemoryPlan, Verbosity, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
@@ -83,12 +83,7 @@ pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     run.check_target(&request.input.path)?;
     run.check(&scene)?;
     let needs = |work: &Workload, limits: &_| run.estimates(work, limits);
-    let plan = MemoryPlan::fit_budget(
-        scene.workload(),
-        Budget { tell: Verbosity::Nothing, ..input.memory },
-        &input.events,
-        needs,
-    )?;
+    let plan = MemoryPlan::fit_budget(scene.workload(), input.memory, &input.events, needs)?;
     scene.apply_plan(&plan);
     let forecast = forecast(&mut scene, &plan, &run, MeasuredOnArrival::default())?;
     let mut journal = Journal::default();

@@ -281,6 +281,8 @@ fn run_prints_its_estimate_before_any_work() {
     assert!(first[0].starts_with("time: ") && first[1].starts_with("memory: at most "), "{}", real.stderr);
     let run = workplace.done("compress {tiny} --cameras {tiny} -o out.gseq --dry-run");
     assert!(run.contains("\ntime: ") && run.contains("\nwould write out.gseq, out.gseq.recipe.toml"), "{run}");
+    let planned = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq --dry-run --explain");
+    assert!(planned.stderr.starts_with("budget: ") && planned.stderr.contains("\n  scan "), "{}", planned.stderr);
     let explained = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq --explain");
     let place = |what: &str| explained.stderr.find(what).unwrap_or_else(|| panic!("{what}: {}", explained.stderr));
     assert!(place("\ntime: ") < place("] scan  ") && place("\ncore-seconds: scan ") < place("] scan  "));
