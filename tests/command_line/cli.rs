@@ -170,7 +170,7 @@ fn a_dash_is_an_output_of_convert_alone() {
     let workplace = Workplace::new();
     for arguments in ["compress {tiny} --no-refine --ratio 10% -o -", "view {tiny} -o -", "man -", "sweep {tiny} -o -"]
     {
-        workplace.refused(2, arguments, &["-: expected the name of a file", "convert NAME.gseq -"]);
+        workplace.refused(2, arguments, &["-: expected the name of a file", "convert INPUT -"]);
     }
 }
 

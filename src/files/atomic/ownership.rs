@@ -222,7 +222,7 @@ pub(super) fn check_no_stream(target: &Path) -> Result<()> {
     match target == Path::new("-") {
         true => Err(Error::usage(
             "-: expected the name of a file or folder to write, found '-', which stands for standard output\n  \
-             only `splatsieve convert NAME.gseq -` writes there, a frame stream; ./- is a file or folder named '-'",
+             only `splatsieve convert INPUT -` writes there, a frame stream; ./- is a file or folder named '-'",
         )),
         false => Ok(()),
     }
