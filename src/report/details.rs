@@ -58,7 +58,7 @@ pub(super) fn details(
         (
             "scores",
             "Scores of the Gaussians",
-            "Values by which the run decided which Gaussians stay: those of kept, dropped and merged ones.",
+            "Scores and statistics of kept, dropped and merged Gaussians.",
             each(&|result, _| score_histograms(&result.data)),
         ),
         (
@@ -222,11 +222,12 @@ fn score_histograms(result: &CompressedModelData) -> String {
         );
     };
     let mut out = String::from(
-        "<p class=\"note\">Number of Gaussians of the original by value: kept ones at the bottom of each bar, then dropped \
-         ones, then those merged into others. Values go by powers of ten, but shares of the frames from none to all; 0 has \
-         no place among powers of ten, and Gaussians at 0 are counted in the legend. Where kept and dropped ones lie apart, \
-         the value decides; where they overlap, something else decides. S is the whole score, C the coverage, W the visible \
-         coverage, D the motion, κ the rigidity, V the variation, in the symbols of the paper.</p>\n<div class=\"charts\">\n",
+        "<p class=\"note\">Number of Gaussians of the original by value: kept ones at the bottom of each bar, then \
+         dropped ones, then those merged into others. Values go by powers of ten, but shares of the frames from none \
+         to all; 0 has no place among powers of ten, and Gaussians at 0 are counted in the legend. Kept and dropped \
+         ones lie apart in values that agree with the selection, and overlap in the others. The recipe says which \
+         values decide: the default ranks by C and W, then by the errors that removals cause in renders, which are \
+         not shown; D, κ (kappa), V and S decide nothing there.</p>\n<div class=\"charts\">\n",
     );
     let mut alike = Vec::new();
     for of in histograms {
