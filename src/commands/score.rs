@@ -31,7 +31,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     let plan = |meta: InputMeta, _: &Workload| {
         Ok(RunPlan::measure_only(MeasureStages::new(recipe, meta.has_cameras, UserOverrides::default()), meta))
     };
-    let (scene, plan, arrived) = open_to_measure(input, plan, journal)?;
+    let (scene, plan, arrived) = open_to_measure(input, |_| Ok(()), plan, journal)?;
     let scored = plan.measure.measure(&scene, arrived, journal)?;
     let scores = scored.scores(&recipe.score)?;
     let rows = scored.rows()?;

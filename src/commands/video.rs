@@ -17,9 +17,9 @@ use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_b
 use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::camera_path::cameras_along;
-use crate::scene::open_compressed;
 use crate::scene::view_selection::{self, ViewSet, render_background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
+use crate::scene::{check_compressed, open_compressed};
 
 /// Name of the rendering stage, for progress.
 const NAME: &str = "render";
@@ -91,6 +91,7 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     inputs.extend(options.input.cameras.as_deref());
     inputs.extend(options.beside.as_deref());
     check_target(output, TargetKind::File, &inputs, options.overwrite)?;
+    options.beside.as_deref().map_or(Ok(()), check_compressed)?;
 
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
     let own = views_with_times(&mut opened, options.input.frames.is_some());

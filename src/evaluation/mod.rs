@@ -47,7 +47,7 @@ use crate::render::Image;
 use crate::scene::photographs::Photographs;
 use crate::scene::view_selection::{self, ViewSet, render_background, select_frames, select_views, spread_views};
 use crate::scene::views_outside::{RigCone, training_cameras};
-use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
+use crate::scene::{InputOptions, Scene, check_compressed, open_compressed, open_scene};
 
 /// Name of the evaluation stage, for progress and cache entries.
 const NAME: &str = "evaluate";
@@ -181,6 +181,7 @@ impl ModelPair {
     /// # Errors
     /// Fails if inputs, cameras or the folder of photographs cannot be read, or if the models have different frames.
     pub fn open(options: &EvaluateOptions) -> Result<ModelPair> {
+        check_compressed(&options.compressed)?;
         let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
         let compressed = open_compressed(&options.compressed, &scene, &options.original)?;
         let background = render_background(options.background, &scene)?;

@@ -75,6 +75,19 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
     }
 }
 
+/// Checks that a sequence of `frames` frames in which every frame is stored can be written as the kind of output `kind`
+/// to `path`.
+///
+/// # Errors
+/// Fails if it cannot be written; the message lists kinds of output that work.
+pub fn check_frames_output(frames: usize, kind: OutputKind, path: &Path) -> Result<()> {
+    kind.check_frames(frames, path)?;
+    match kind {
+        OutputKind::Archive => Ok(()),
+        _ => check_output(frames, kind, path),
+    }
+}
+
 /// Writes the compressed model `compressed` of `source` as the kind of output `kind` to `path`; returns notes for the
 /// user. Fails if frames cannot be read or a write fails.
 pub(super) fn write_trajectories(

@@ -1,5 +1,6 @@
 //! Parser for lists of ids of Gaussians that the user wants to keep or drop.
 
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use crate::error::{Error, Result, quoted};
@@ -16,13 +17,29 @@ const MAX_LIST: u64 = 32 << 20;
 /// Fails if a word is no id or range, if a range is reversed, or if an id is not below `count`, the number of
 /// Gaussians.
 pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
+    let mut ids = Vec::new();
+    for_each_range(spec, count, |range| ids.extend(range))?;
+    ids.sort_unstable();
+    ids.dedup();
+    Ok(ids)
+}
+
+/// Checks the ids that `spec` names, as far as this is possible before the number of Gaussians is known.
+///
+/// # Errors
+/// Fails like [`parse_ids`], except for ids that are too high.
+pub(super) fn check_ids(spec: &str) -> Result<()> {
+    for_each_range(spec, u32::MAX as usize, |_| ())
+}
+
+/// Calls `take` with every range of ids in `spec`; a single id is a range of one. Fails like [`parse_ids`].
+fn for_each_range(spec: &str, count: usize, mut take: impl FnMut(RangeInclusive<u32>)) -> Result<()> {
     let is_list = spec.chars().all(|c| c.is_ascii_digit() || matches!(c, ',' | '-') || c.is_ascii_whitespace());
     let (text, origin) = if is_list {
         (spec.to_owned(), "id list".to_owned())
     } else {
         (read_text(Path::new(spec), MAX_LIST)?, spec.to_owned())
     };
-    let mut ids = Vec::new();
     for (number, line) in text.lines().enumerate() {
         let wrong = |expected: String, found: &str| {
             Error::usage(format!("{origin}, line {}: expected {expected}, found {}", number + 1, quoted(found)))
@@ -42,12 +59,10 @@ pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
             if to as usize >= count {
                 return Err(wrong(format!("ids below {count}, the number of Gaussians"), word));
             }
-            ids.extend(from..=to);
+            take(from..=to);
         }
     }
-    ids.sort_unstable();
-    ids.dedup();
-    Ok(ids)
+    Ok(())
 }
 
 #[cfg(test)]

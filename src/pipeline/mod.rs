@@ -75,12 +75,13 @@ pub fn compress(request: &Request) -> Result<Completion<Summary>> {
 
 fn compress_whole(request: &Request) -> Result<Summary> {
     let mut journal = Journal::default();
+    let check = |frames| RunPlan::before_reading(request, frames)?.check_target(&request.input.path);
     let plan = |input, work: &Workload| {
         let plan = RunPlan::within_memory(request, input, work)?;
         plan.check_target(&request.input.path)?;
         Ok(plan)
     };
-    let (scene, plan, arrived) = open_to_measure(&request.input, plan, &mut journal)?;
+    let (scene, plan, arrived) = open_to_measure(&request.input, check, plan, &mut journal)?;
     Ok(run_stages(&scene, &plan, arrived, request, journal)?.summary)
 }
 
@@ -102,10 +103,11 @@ pub fn compress_scene(scene: &Scene, request: &Request) -> Result<CompressedScen
 /// # Errors
 /// Fails if the input cannot be opened, if the request is invalid, or if the memory budget is too small for it.
 pub fn shardable_stages(request: &Request) -> Result<Vec<String>> {
+    let check = |frames| RunPlan::before_reading(request, frames).map(|_| ());
     let plan = |input, work: &Workload| RunPlan::within_memory(request, input, work);
     let memory = Budget { tell: Verbosity::Nothing, ..request.input.memory };
     let input = InputOptions { work: None, memory, ..request.input.clone() };
-    let (scene, plan, _) = open_to_measure(&input, plan, &mut Journal::default())?;
+    let (scene, plan, _) = open_to_measure(&input, check, plan, &mut Journal::default())?;
     Ok(plan.describe_shardable_work(&scene))
 }
 

@@ -49,13 +49,18 @@ use crate::statistics::pass::RunningScan;
 /// - frames whose Gaussians have to be linked: after the stage [`track`], which finds how many Gaussians there are;
 /// - other input: after it is opened.
 ///
+/// Frames that arrive on a stream or have to be linked take long to open. For them, the function `check` is called
+/// earlier, to find errors of the request: before a stream is received, and before frames are linked. Its argument is
+/// the number of frames, if known.
+///
 /// Returns the scene and the plan of the run. Also returns the statistics of the Gaussians if the input is a stream and
 /// they were computed while it arrived (see [`receive_measured`]).
 ///
 /// # Errors
-/// Fails if the input, the cameras or the budget is invalid, or if `plan` fails.
+/// Fails if the input, the cameras or the budget is invalid, or if `check` or `plan` fails.
 pub fn open_to_measure(
     options: &InputOptions,
+    check: impl Fn(Option<usize>) -> Result<()>,
     plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
     journal: &mut Journal,
 ) -> Result<(Scene, RunPlan, Option<Measured>)> {
@@ -63,6 +68,7 @@ pub fn open_to_measure(
     let opened = if options.is_stream() {
         let rig = load_stream_cameras(options)?;
         let stream = open_stream(options)?;
+        check(None)?;
         if !is_linked(stream.header(), options) {
             let (mut scene, stages, measured) = receive_measured(stream, rig, options, plan, journal)?;
             scene.add_outside_views(stages.measure.scan.recipe.outside);
@@ -73,6 +79,9 @@ pub fn open_to_measure(
     } else {
         open_untracked(options)?
     };
+    if let Opened::Unlinked(frames) = &opened.opened {
+        check(Some(frames.times().len()))?;
+    }
     let mut scene = from_input(track::run(opened, options, &mut start, journal)?, options)?;
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
     scene.add_outside_views(stages.measure.scan.recipe.outside);

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::ids::parse_ids;
+use super::ids::{check_ids, parse_ids};
 use super::planning::{InputMeta, MemoryFallback, OptionalWork, Planning};
 use super::request::{Goal, PruneOrMerge, Quality, Request, decibels};
 use super::search::SearchStage;
@@ -14,6 +14,7 @@ use super::stages::write::WriteStage;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
+use crate::models::trajectories::check_frames_output;
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
 use crate::pruning::visibility::VisibilityStage;
@@ -48,6 +49,23 @@ impl RunPlan {
     /// that the request names does not exist in the input, or if options exclude each other.
     pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
         RunPlan::with_fallback(request, input, MemoryFallback::Nothing, OptionalWork::ALL)
+    }
+
+    /// Returns a plan of a run for `request` whose input is a sequence of frames that has not been read yet. Only the
+    /// output of this plan is valid: the number of Gaussians is not known. `frames`: number of frames, if known.
+    ///
+    /// # Errors
+    /// Fails in the cases in which [`RunPlan::new`] fails, as far as they can be found without the number of Gaussians.
+    /// Also fails if the kind of output cannot store a sequence of `frames` frames.
+    pub fn before_reading(request: &Request, frames: Option<usize>) -> Result<RunPlan> {
+        [&request.keep_ids, &request.drop_ids].into_iter().flatten().try_for_each(|ids| check_ids(ids))?;
+        let named = Request { keep_ids: None, drop_ids: None, ..request.clone() };
+        let plan = RunPlan::new(&named, InputMeta::from_stream(u32::MAX as usize, true))?;
+        if let Some(WriteStage { kind, .. }) = plan.output {
+            // A stream may turn out to have only one frame.
+            check_frames_output(frames.unwrap_or(1), kind, &request.output)?;
+        }
+        Ok(plan)
     }
 
     /// Returns the plan of a run that only runs `measure`, the stages that compute the statistics and scores of the

@@ -15,9 +15,9 @@ use crate::player::poster::{self, render_poster};
 use crate::player::quantization::{PlayerSteps, component_count};
 use crate::player::track::{MAX_VALUES_PER_FRAME_GROUP, PageSequence, encode};
 use crate::progress::Events;
-use crate::scene::open_compressed;
 use crate::scene::view_selection::render_background;
 use crate::scene::{InputOptions, first_frame_box, open_scene, scratch_beside};
+use crate::scene::{check_compressed, open_compressed};
 
 /// Name of the stage that writes the page, for progress messages and the memory plan.
 const NAME: &str = "view";
@@ -102,6 +102,7 @@ fn is_page(output: &Path) -> bool {
 /// Fails if the inputs, the cameras or the output are invalid. Nothing is written then.
 pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     check(options)?;
+    options.compressed.as_deref().map_or(Ok(()), check_compressed)?;
     let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
     if scene.source().info().times.is_empty() {
         return Err(Error::input(&options.original.path, "", "at least one frame to show", "none"));

@@ -1,5 +1,6 @@
 //! Opens a compressed model for comparison with its original.
 
+use std::fs;
 use std::path::Path;
 
 use super::{InputOptions, Scene};
@@ -9,6 +10,20 @@ use crate::models::{self, InputModel, OpenOptions, TimeOrigin};
 /// Maximum difference between the times of the same frame in two models, as a fraction of the time span of the
 /// sequence. Times that were written to a file are rounded, so they may differ slightly.
 const TIME_TOLERANCE: f64 = 1e-6;
+
+/// Checks that the compressed model at `path` exists. Called before the original is opened, which can take long.
+///
+/// # Errors
+/// Fails if `path` does not exist, or if it is `-`: only the original can be a stream.
+pub fn check_compressed(path: &Path) -> Result<()> {
+    if path == Path::new("-") {
+        return Err(Error::usage(
+            "the compressed model: expected a file or a folder, found -; only the original can be a stream on standard \
+             input\n  write the stream to a container first: splatsieve convert - NAME.gseq",
+        ));
+    }
+    fs::metadata(path).map_err(Error::io("open", path)).map(|_| ())
+}
 
 /// Opens the compressed model at `path`, with frames at the times of the frames of `original`. `options` are the
 /// options with which the original was opened; the training iteration in them is ignored.

@@ -16,4 +16,5 @@ mod refine;
 mod scene;
 mod selection;
 mod sweep;
+mod tracked_inputs;
 mod trained_models;

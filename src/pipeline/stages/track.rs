@@ -123,6 +123,20 @@ mod tests {
     }
 
     #[test]
+    fn requests_are_refused_before_linking() {
+        let folder = tempfile::tempdir().unwrap();
+        let (options, recorder) = unlinked_frames(folder.path());
+        let exists = folder.path().join("exists.gseq");
+        fs::write(&exists, "old").unwrap();
+        for (output, part) in [(exists, "exists"), (folder.path().join("small.spz"), "3 frames do not fit one .spz")] {
+            let request = Request::new(options.clone(), output, Recipe::preset("paper").unwrap());
+            let error = compress(&request).err().unwrap().to_string();
+            assert!(error.contains(part), "{error}");
+        }
+        assert!(recorder.0.lock().unwrap().is_empty());
+    }
+
+    #[test]
     fn tracking_is_the_first_stage_of_the_plan_and_of_the_summary() {
         let folder = tempfile::tempdir().unwrap();
         let (options, recorder) = unlinked_frames(folder.path());

@@ -1,0 +1,78 @@
+//! Tests of inputs whose frames have to be linked, and of frame streams: errors that come before any work, messages
+//! that name the files of the user, and notes about the renders of tracks.
+
+use std::fs;
+
+use crate::scene::{Workplace, stderr_text};
+use splatsieve::model::{Gaussians, hash_id};
+
+/// Header of a stream: version, SH degree 0, `count` Gaussians, all attributes with every frame.
+fn header(version: u32, count: u32) -> Vec<u8> {
+    let mut bytes = b"\x89GSTR\r\n\x1a".to_vec();
+    for field in [version, 0, count, 0, 31, 0] {
+        bytes.extend(u32::to_le_bytes(field));
+    }
+    bytes
+}
+
+/// Returns a stream of version 2 of the frames `frames`, of SH degree 0.
+fn stream(frames: &[Gaussians]) -> Vec<u8> {
+    let mut bytes = header(2, 0);
+    for (number, frame) in (0u32..).zip(frames) {
+        let columns = [&frame.position, &frame.rotation, &frame.log_scale, &frame.opacity_logit, &frame.sh];
+        let values: Vec<u8> =
+            columns.iter().flat_map(|column| column.planes()).flat_map(|value| value.to_le_bytes()).collect();
+        bytes.extend(b"FRAM");
+        bytes.extend(number.to_le_bytes());
+        bytes.extend((f64::from(number) / frames.len() as f64).to_le_bytes());
+        bytes.extend((values.len() as u64).to_le_bytes());
+        bytes.extend(values);
+    }
+    bytes.extend(b"DONE");
+    bytes.extend((frames.len() as u32).to_le_bytes());
+    bytes.extend([0; 16]);
+    bytes
+}
+
+/// Returns `count` Gaussians of SH degree 0 at frame `frame`. Their order differs from frame to frame, and their colors
+/// change slightly.
+fn frame(count: usize, frame: usize) -> Gaussians {
+    let mut out = Gaussians::zeros(count, 0);
+    let mut order: Vec<usize> = (0..count).collect();
+    order.sort_by_key(|&i| hash_id((i as u64) << 20 | frame as u64));
+    for (at, &i) in order.iter().enumerate() {
+        let value = |k: u64| (hash_id(16 * i as u64 + k) >> 40) as f32 / (1u64 << 24) as f32;
+        out.position.set_row(at, [value(0), value(1), value(2) + 0.001 * frame as f32]);
+        out.rotation.set_row(at, [1.0, 0.0, 0.0, 0.0]);
+        out.log_scale.set_row(at, [-3.0 + value(3), -3.0, -3.0]);
+        out.opacity_logit.set_row(at, [1.0 + value(4)]);
+        out.sh.set_row(at, [value(5), value(6), value(7) + 0.002 * (hash_id(frame as u64) % 2) as f32]);
+    }
+    out
+}
+
+#[test]
+fn request_is_checked_before_a_stream_is_received() {
+    let workplace = Workplace::new();
+    fs::write(workplace.path("exists.gseq"), "old").unwrap();
+    // Nothing follows the header: reading the first frame would fail.
+    for (bytes, link) in [(header(2, 0), "auto"), (header(1, 5), "always"), (header(1, 5), "auto")] {
+        for (arguments, part) in [
+            ("-o exists.gseq", "--overwrite"),
+            ("-o out.zip", "does not write .zip files"),
+            ("-o none/out.gseq", "the folder none"),
+            ("-o out.gseq --keep-ids none.txt", "none.txt"),
+            ("-o out.gseq --keep-ids 3-x", "3-x"),
+            ("-o out.gsz --max-loss 1 --ground-truth .", "--max-loss cannot be used for an archive"),
+            ("-o out.gseq --min-psnr 30 --merge-only", "--merge-only"),
+            ("-o out --as model", "only a trained model"),
+        ] {
+            let output = workplace.piped(&format!("compress - --link {link} {arguments}"), &bytes);
+            let said = stderr_text(&output);
+            assert!(!output.status.success() && said.contains(part), "{arguments}: {said}");
+        }
+    }
+    let output = workplace.piped("evaluate - none.gseq", &header(2, 0));
+    assert!(stderr_text(&output).contains("none.gseq"), "{}", stderr_text(&output));
+    workplace.refused(2, "evaluate {tiny} -", &["only the original can be a stream"]);
+}
