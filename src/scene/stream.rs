@@ -11,8 +11,8 @@ use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, Rig};
-use crate::models::MemoryProfile;
 use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
+use crate::models::{LinkMode, MemoryProfile};
 use crate::models::{Opened, UnlinkedFrames};
 use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::statistics;
@@ -39,7 +39,11 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     if stdin.is_terminal() {
         return Err(Error::usage("standard input is a terminal; pipe a frame stream into it (format/STREAM.md)"));
     }
-    FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
+    let stream = FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())?;
+    match options.link == LinkMode::Never && stream.header().is_unlinked {
+        true => stream.with_common_indices(),
+        false => Ok(stream),
+    }
 }
 
 /// Loads the cameras that `options` name for a stream, before its frames arrive; `None` if `options` name none. Their
@@ -93,7 +97,8 @@ fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Rec
 /// Returns whether Gaussians of successive frames are linked into tracks (Gaussians followed through frames): if the
 /// frames share no Gaussian ids, or if the user asks for it.
 pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
-    header.is_unlinked || options.link.links_frames_always()
+    let is_needed = header.is_unlinked && options.link != LinkMode::Never;
+    is_needed || options.link.links_frames_always()
 }
 
 /// Receives a stream of frames whose Gaussians are to be linked into tracks (Gaussians followed through frames). Only for

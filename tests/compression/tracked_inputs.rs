@@ -76,3 +76,22 @@ fn request_is_checked_before_a_stream_is_received() {
     assert!(stderr_text(&output).contains("none.gseq"), "{}", stderr_text(&output));
     workplace.refused(2, "evaluate {tiny} -", &["only the original can be a stream"]);
 }
+
+#[test]
+fn stream_that_is_not_linked_needs_equal_frames() {
+    let workplace = Workplace::new();
+    let frames: Vec<Gaussians> = (0..4).map(|t| frame(40, t)).collect();
+    let output = workplace.piped("convert - same.gseq --link never", &stream(&frames));
+    assert!(output.status.success(), "{}", stderr_text(&output));
+    let said = workplace.done("info same.gseq");
+    assert!(said.contains("40 Gaussians") || said.contains("40"), "{said}");
+    let frames = [frame(40, 0), frame(40, 1), frame(39, 2)];
+    for command in ["convert - out.gseq", "compress - -o out.gseq"] {
+        let output = workplace.piped(&format!("{command} --link never"), &stream(&frames));
+        let said = stderr_text(&output);
+        let parts = ["standard input, frame 2", "40 Gaussians, as in frame 0", "39 Gaussians", "--link"];
+        assert!(!output.status.success() && parts.iter().all(|part| said.contains(part)), "{said}");
+    }
+    let empty = workplace.piped("convert - out.gseq --link never", &stream(&[]));
+    assert!(stderr_text(&empty).contains("at least one frame"));
+}

@@ -15,7 +15,8 @@ const END_MAGIC: [u8; 4] = *b"DONE";
 /// Header of a stream, before its first frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StreamHeader {
-    /// N, the number of Gaussians in every frame; below 2³². 0 if the frames are unlinked.
+    /// N, the number of Gaussians in every frame; below 2³². 0 if the frames are unlinked, until
+    /// [`FrameStream::with_common_indices`](super::FrameStream::with_common_indices) sets it.
     pub count: usize,
     /// SH degree, 0 to 3.
     pub sh_degree: usize,

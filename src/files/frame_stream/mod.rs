@@ -32,6 +32,10 @@ pub struct FrameStream<R> {
     last_time: Option<f64>,
     ended: bool,
     memory: ReadLimit,
+    /// Mark that was read ahead of its frame.
+    next_mark: Option<FrameMark>,
+    /// Whether the same index means the same Gaussian in every frame, although the stream does not say so.
+    has_common_indices: bool,
 }
 
 /// Source of bytes that counts how many it has delivered.
@@ -69,7 +73,32 @@ impl<R: Read> FrameStream<R> {
                 return Err(bytes.ended(&format!("the constant column {}", column.name()), None));
             }
         }
-        Ok(FrameStream { bytes, header, constant, frames: 0, last_time: None, ended: false, memory })
+        Ok(FrameStream {
+            bytes,
+            header,
+            constant,
+            frames: 0,
+            last_time: None,
+            ended: false,
+            memory,
+            next_mark: None,
+            has_common_indices: false,
+        })
+    }
+
+    /// Returns this stream of unlinked frames as one in which the same index means the same Gaussian in every frame.
+    /// The mark of the first frame gives the number of Gaussians in the header; later frames must have as many.
+    ///
+    /// # Errors
+    /// Fails if the mark violates format/STREAM.md, or if the stream has no frames.
+    pub fn with_common_indices(mut self) -> Result<FrameStream<R>> {
+        let mark = self.read_mark()?;
+        let FrameMark::Frame { bytes, .. } = mark else {
+            return Err(Error::input(&self.bytes.name, "", "at least one frame", "the end of the stream"));
+        };
+        self.header.count = (bytes / self.header.gaussian_bytes()) as usize;
+        (self.next_mark, self.has_common_indices) = (Some(mark), true);
+        Ok(self)
     }
 
     /// Returns the header of the stream.
@@ -104,22 +133,26 @@ impl<R: Read> FrameStream<R> {
         if self.ended {
             return Ok(None);
         }
-        let (start, frame) = (self.bytes.received, self.frames);
-        let mut mark = [0; FrameMark::BYTES];
-        if self.bytes.read_up_to(&mut mark)? < mark.len() {
-            return Err(self.bytes.ended(&format!("frame {frame} or the end mark"), Some(frame)));
-        }
-        let mark = FrameMark::from_bytes(&mark, &self.header, frame, self.last_time)
-            .map_err(|illegal| self.bytes.error(start, Some(frame), illegal))?;
+        let frame = self.frames;
+        let mark = match self.next_mark.take() {
+            Some(mark) => mark,
+            None => self.read_mark()?,
+        };
+        let length_place = place(self.bytes.received - FrameMark::BYTES as u64 + 16, Some(frame));
         let FrameMark::Frame { time, bytes, .. } = mark else {
             self.ended = true;
             return self.expect_end().map(|()| None);
         };
-        self.memory.check(&self.bytes.name, &place(start + 16, Some(frame)), "one frame", bytes)?;
+        self.memory.check(&self.bytes.name, &length_place, "one frame", bytes)?;
         let count = match self.header.is_unlinked {
             true => (bytes / self.header.gaussian_bytes()) as usize,
             false => self.header.count,
         };
+        if self.has_common_indices && count != self.header.count {
+            let expected = format!("{} Gaussians, as in frame 0", self.header.count);
+            return Err(Error::input(&self.bytes.name, length_place, expected, format!("{count} Gaussians"))
+                .hint("every frame must hold the same Gaussians in the same order, unless they are linked (--link)"));
+        }
         for column in self.header.varying.iter() {
             if !self.bytes.read_attribute(count, out.attribute_values_mut(column))? {
                 let expected = format!("the rest of frame {frame} (column {})", column.name());
@@ -132,6 +165,17 @@ impl<R: Read> FrameStream<R> {
         };
         (self.frames, self.last_time) = (next, Some(time));
         Ok(Some(time))
+    }
+
+    /// Reads the mark before the next frame or at the end of the stream.
+    fn read_mark(&mut self) -> Result<FrameMark> {
+        let (start, frame) = (self.bytes.received, self.frames);
+        let mut mark = [0; FrameMark::BYTES];
+        if self.bytes.read_up_to(&mut mark)? < mark.len() {
+            return Err(self.bytes.ended(&format!("frame {frame} or the end mark"), Some(frame)));
+        }
+        FrameMark::from_bytes(&mark, &self.header, frame, self.last_time)
+            .map_err(|illegal| self.bytes.error(start, Some(frame), illegal))
     }
 
     /// Checks that no bytes follow the end mark.
