@@ -345,8 +345,13 @@ impl ModelPair {
             original: scene.path.to_string_lossy().into_owned(),
             compressed: self.compressed_as.path.to_string_lossy().into_owned(),
         };
+        let tracked = [("original", &*scene.input), ("compressed", &*self.compressed)];
+        let note =
+            |(role, input): (&str, &dyn InputModel)| Some(format!("the {role} model: {}", input.tracking_note()?));
         let size = OriginalAndCompressed { original: scene.input.size()?, compressed: self.compressed.size()? };
+        let larger = size.compressed.why_larger_than(&size.original);
         Ok(Evaluation {
+            notes: tracked.into_iter().filter_map(note).chain(scene.notes.iter().cloned()).chain(larger).collect(),
             tool: TOOL.to_owned(),
             path,
             count: OriginalAndCompressed { original: count(&*scene.input), compressed: count(&*self.compressed) },
@@ -363,7 +368,6 @@ impl ModelPair {
             rig_sides: InsideOutsideMeans::from_views(&view_qualities, &self.outside_views()),
             ground_truth,
             render_ms: None,
-            notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             work_notes: scene.work.take_notes(),
             views: view_qualities,
         })

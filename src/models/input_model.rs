@@ -142,6 +142,12 @@ pub trait InputModel: Send + Sync {
         Ok(Vec::new())
     }
 
+    /// Returns a note for the user about the renders of frames that were changed when they were linked; `None` if each
+    /// frame has the renders of the input.
+    fn tracking_note(&self) -> Option<String> {
+        None
+    }
+
     /// Returns the kind of output that is written if neither the user nor the output path specifies one.
     fn default_output_kind(&self) -> OutputKind {
         DEFAULT_OUTPUT

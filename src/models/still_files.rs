@@ -204,6 +204,10 @@ impl InputModel for StillFiles {
         self.inner.notes()
     }
 
+    fn tracking_note(&self) -> Option<String> {
+        self.inner.tracking_note()
+    }
+
     fn default_output_kind(&self) -> OutputKind {
         self.inner.default_output_kind()
     }

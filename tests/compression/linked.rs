@@ -190,7 +190,7 @@ fn lives_that_fade_into_one_another_become_one_track() {
     let notes = joined.input.notes().join("\n");
     assert!(
         notes.contains(&format!("{apart_count} tracks with a median length of "))
-            && notes.contains("renders stay within"),
+            && notes.contains("dB PSNR, mean of renders"),
         "{notes}"
     );
     assert!(!apart.input.notes().join("\n").contains("were joined"));
@@ -338,7 +338,7 @@ fn steady_attributes_of_a_track_become_their_mean() {
     }
     assert!(parts.iter().flatten().all(|&part| part > 20), "{parts:?}");
     let notes = held.input.notes().join("\n");
-    assert!(notes.contains("% of the colors (within 0.04)") && notes.contains("renders stay within"), "{notes}");
+    assert!(notes.contains("% of the colors (within 0.04)") && notes.contains("dB PSNR, mean of renders"), "{notes}");
     // The written files have the same values, to the bit.
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
     for (t, found) in found.iter().enumerate() {

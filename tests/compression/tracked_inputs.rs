@@ -95,3 +95,21 @@ fn stream_that_is_not_linked_needs_equal_frames() {
     let empty = workplace.piped("convert - out.gseq --link never", &stream(&[]));
     assert!(stderr_text(&empty).contains("at least one frame"));
 }
+
+#[test]
+fn evaluation_notes_which_model_was_tracked() {
+    let workplace = Workplace::new();
+    for t in 0..12 {
+        workplace.ply(&format!("frames/{t:02}.ply"), &frame(300, t));
+    }
+    workplace.done("convert frames apart.gseq --link apart");
+    let note = |arguments: &str| {
+        let said = workplace.done(&format!("evaluate {arguments} --max-views 2"));
+        said.lines().find(|line| line.contains("its frames were linked")).map(str::to_owned)
+    };
+    let original = note("frames apart.gseq").unwrap();
+    assert!(original.contains("the original model: ") && original.contains("--link apart compares"), "{original}");
+    let compressed = note("apart.gseq frames").unwrap();
+    assert!(compressed.contains("the compressed model: ") && compressed.contains("dB PSNR"), "{compressed}");
+    assert_eq!(note("frames apart.gseq --link apart"), None);
+}

@@ -51,6 +51,9 @@ struct LinkedFrames {
     /// may have been replaced.
     info: SequenceInfo,
     notes: Vec<String>,
+    /// Smallest mean PSNR, dB, of renders after a simplification of the tracks (joining, means of attributes) against
+    /// renders before it; `None` if the tracks were not simplified.
+    simplified_psnr: Option<f64>,
     /// Owner of the container's file; deletes the file when it is dropped.
     _scratch: ScratchFile,
     /// Origin of frames that were unpacked from another input, such as a container or a stream; `None` if the user gave
@@ -92,8 +95,10 @@ impl LinkedFrames {
         let info = container.info().clone();
         let mut notes = vec![format!("frames were linked: {why}")];
         notes.extend(found.notes(&tracks)?);
-        notes.extend(joined.into_iter().chain(held).chain(not_read));
-        Ok(LinkedFrames { tracks, container, info, notes, _scratch: packed, origin: None })
+        let psnrs = [joined.as_ref(), held.as_ref()].into_iter().flatten().filter_map(|step| step.psnr);
+        let simplified_psnr = psnrs.reduce(f64::min);
+        notes.extend(joined.into_iter().chain(held).map(|step| step.note).chain(not_read));
+        Ok(LinkedFrames { tracks, container, info, notes, simplified_psnr, _scratch: packed, origin: None })
     }
 }
 
@@ -178,6 +183,15 @@ impl InputModel for LinkedFrames {
 
     fn notes(&self) -> Vec<String> {
         self.notes.clone()
+    }
+
+    fn tracking_note(&self) -> Option<String> {
+        let psnr = self.simplified_psnr?;
+        Some(format!(
+            "its frames were linked, and its tracks joined or partly replaced by means, which changes its renders: \
+             {psnr:.1} dB PSNR, the mean of a few renders; views can have less. --link apart compares the frames as they \
+             are"
+        ))
     }
 
     fn write(

@@ -30,14 +30,22 @@ const VIEWS: usize = 3;
 /// differences that trainers leave between tracks of one Gaussian; the second is half as large.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
+/// Attempt to simplify the tracks (Gaussians followed through frames) of frames.
+pub(super) struct Simplification {
+    /// Note for the user.
+    pub(super) note: String,
+    /// Mean PSNR, dB, of a few renders after the change against renders before it; `None` if no render changed.
+    pub(super) psnr: Option<f64>,
+}
+
 /// Joins those of `tracks` (Gaussians followed through frames) that seem to be the same Gaussian. `joiner` proposes two
 /// ways to join them. The proposals are tried in order, and the first one with which renders reach [`MIN_PSNR_DB`] is
-/// kept; if there is none, no tracks are joined. `linker` is the linker that made the tracks. Returns a note for the
-/// user that says whether tracks were joined; `None` if neither proposal joins any tracks.
+/// kept; if there is none, no tracks are joined. `linker` is the linker that made the tracks. Returns `None` if neither
+/// proposal joins any tracks.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
-pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -> Result<Option<String>> {
+pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -> Result<Option<Simplification>> {
     let (before, median_length) = (tracks.count(), tracks.lengths()?.median());
     let mut note = None;
     for (joined_tracks, count) in joiner.finish(linker) {
@@ -49,25 +57,28 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -
         if psnr.is_none_or(|psnr| psnr >= MIN_PSNR_DB) {
             let cost = psnr_note(psnr.unwrap_or(f64::INFINITY));
             let separate = format!("{before} tracks with a median length of {median_length} frames");
-            return Ok(Some(format!("{separate} were joined to {count} tracks: {cost}")));
+            return Ok(Some(Simplification {
+                note: format!("{separate} were joined to {count} tracks: {cost}"),
+                psnr,
+            }));
         }
         tracks.undo_join();
         let psnr = psnr.unwrap_or_default();
-        note = Some(format!(
-            "tracks that may be the same Gaussian were not joined: renders with joined tracks reach only \
-                          {psnr:.1} dB PSNR"
-        ));
+        let text = format!(
+            "tracks that may be the same Gaussian were not joined: renders with joined tracks reach only {psnr:.1} dB \
+             PSNR"
+        );
+        note = Some(Simplification { note: text, psnr: None });
     }
     Ok(note)
 }
 
 /// Replaces nearly constant attributes of `tracks` (Gaussians followed through frames) by their means, with the first
-/// of [`STEADY_BOUNDS`] with which renders reach [`MIN_PSNR_DB`]. Returns a note for the user if any attribute became
-/// constant.
+/// of [`STEADY_BOUNDS`] with which renders reach [`MIN_PSNR_DB`]. Returns `None` if no attribute became constant.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or a write to the folder `scratch` fails.
-pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<String>> {
+pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<Simplification>> {
     let first = tracks.first();
     for bound in STEADY_BOUNDS {
         // Tracks are numbered in the order of their first frames, so none of the range begins earlier.
@@ -88,12 +99,13 @@ pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<O
         if psnr >= MIN_PSNR_DB {
             let [colors, scales, rotations, opacities] = parts.map(|part| format!("{:.0}%", 100.0 * part));
             let Bound { color, other } = bound;
-            return Ok(Some(format!(
+            let note = format!(
                 "nearly constant attributes of tracks were replaced by their means: {colors} of the colors (within \
                  {color}), {scales} of the scales, {rotations} of the rotations and {opacities} of the opacities \
                  (within {other}): {}",
                 psnr_note(psnr)
-            )));
+            );
+            return Ok(Some(Simplification { note, psnr: Some(psnr) }));
         }
         tracks.set_steady(None);
     }
@@ -157,7 +169,12 @@ fn mean_psnr(a: &[Gaussians], b: &[Gaussians]) -> f64 {
     found.iter().sum::<f64>() / found.len() as f64
 }
 
-/// Formats a PSNR in dB for notes to the user.
+/// Formats the mean PSNR in dB of [`mean_psnr`] for notes to the user.
 fn psnr_note(psnr: f64) -> String {
-    if psnr.is_finite() { format!("renders stay within {psnr:.1} dB PSNR") } else { "renders are unchanged".to_owned() }
+    match psnr.is_finite() {
+        true => {
+            format!("{psnr:.1} dB PSNR, mean of renders of at most {SAMPLED_FRAMES} frames in {VIEWS} virtual views")
+        }
+        false => "renders are unchanged".to_owned(),
+    }
 }
