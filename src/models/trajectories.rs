@@ -14,9 +14,10 @@ use crate::files::glb::write::write_glb;
 use crate::files::ply::write::write_inria;
 use crate::files::sog::write::{SogErrors, visible_only, write_sog};
 use crate::files::spz::{SpzVersion, write_spz};
+use crate::fit::MIN_VISIBLE_OPACITY;
 use crate::limits::Limits;
 use crate::merging::merged_sequence::MergedSequence;
-use crate::model::{Attributes, Gaussians, SequenceInfo};
+use crate::model::{Attributes, Gaussians, SequenceInfo, opacity};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::outputs::curves::write_fitted_splatv;
 use crate::outputs::four_dgs::write_four_dgs;
@@ -210,15 +211,27 @@ pub fn write_sequence(
     }
     let progress = events.task("emit", "frames", info.times.len() as u64);
     let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(max_kept_frames))?;
+    let mut visible = 0;
     for frame in 0..info.times.len() {
         let file = match kind {
             OutputKind::Ply => path.to_owned(),
             _ => path.join(format!("frame_{frame:05}.ply")),
         };
-        write_inria(states.read(frame)?, &[], &file)?;
+        let state = states.read(frame)?;
+        write_inria(state, &[], &file)?;
+        visible += state.opacity_logit.plane(0).iter().filter(|&&logit| opacity(logit) >= MIN_VISIBLE_OPACITY).count();
         progress.advance(1);
     }
-    Ok(Vec::new())
+    let written = info.count * info.times.len();
+    let is_sparse = kind == OutputKind::PlySequence && 2 * visible < written;
+    let percent = 100.0 * visible as f64 / written as f64;
+    Ok(Vec::from_iter(is_sparse.then(|| {
+        format!(
+            "every frame has all {} Gaussians, of which {percent:.0}% on average are visible; for a container, --link \
+             apart writes only the visible ones of each frame",
+            info.count
+        )
+    })))
 }
 
 /// Writes every frame of `source` to a file `frame_0000.sog`, `frame_0001.sog`, … in the folder `path`, without the

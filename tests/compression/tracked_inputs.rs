@@ -113,3 +113,21 @@ fn evaluation_notes_which_model_was_tracked() {
     assert!(compressed.contains("the compressed model: ") && compressed.contains("dB PSNR"), "{compressed}");
     assert_eq!(note("frames apart.gseq --link apart"), None);
 }
+
+#[test]
+fn container_of_tracks_unpacks_to_visible_gaussians_on_request() {
+    let workplace = Workplace::new();
+    let count = |t: usize| 100 - 2 * t;
+    for t in 0..6 {
+        // Every frame is a cut: it shows other Gaussians.
+        let mut gaussians = frame(count(t), t);
+        gaussians.position.planes_mut().iter_mut().for_each(|x| *x += 100.0 * t as f32);
+        workplace.ply(&format!("frames/{t}.ply"), &gaussians);
+    }
+    workplace.done("convert frames tracks.gseq");
+    let all = workplace.run("convert tracks.gseq all");
+    assert!(all.stderr.contains("--link apart writes only the visible ones"), "{}", all.stderr);
+    workplace.done("convert tracks.gseq visible --link apart");
+    let header = fs::read(workplace.path("visible/frame_00003.ply")).unwrap();
+    assert!(String::from_utf8_lossy(&header[..400]).contains(&format!("element vertex {}\n", count(3))));
+}
