@@ -23,6 +23,9 @@ use crate::limits::ReadLimit;
 #[derive(Debug, Clone)]
 pub struct PlyFrames {
     paths: Vec<PathBuf>,
+    /// Paths of the files from which the PLY files were made, for messages; the PLY files themselves if they are the
+    /// user's.
+    shown_paths: Vec<PathBuf>,
     counts: Vec<u32>,
     properties: Vec<Property>,
     sh_degree: usize,
@@ -80,12 +83,22 @@ impl PlyFrames {
             check_properties(&ply, &properties, first_path)?;
             take(&ply);
         }
-        Ok(PlyFrames { paths, counts, properties, sh_degree, texts, memory })
+        Ok(PlyFrames { shown_paths: paths.clone(), paths, counts, properties, sh_degree, texts, memory })
     }
 
     /// Returns the paths of the files in frame order.
     pub fn paths(&self) -> &[PathBuf] {
         &self.paths
+    }
+
+    /// Returns these frames, which messages call by `shown_paths`: the files from which the PLY files were made.
+    pub fn with_shown_paths(self, shown_paths: Vec<PathBuf>) -> PlyFrames {
+        PlyFrames { shown_paths, ..self }
+    }
+
+    /// Returns the paths by which messages call the frames: files of the user, in frame order.
+    pub fn shown_paths(&self) -> &[PathBuf] {
+        &self.shown_paths
     }
 
     /// Returns the number of Gaussians in each frame.

@@ -49,9 +49,11 @@ impl PlySequence {
     pub fn new(frames: PlyFrames) -> Result<PlySequence> {
         if let Some(other) = frames.first_differing_frame() {
             let counts = frames.gaussian_counts();
-            let expected = format!("{} Gaussians, as in {}", counts[0], frames.paths()[0].shown());
+            let expected = format!("{} Gaussians, as in {}", counts[0], frames.shown_paths()[0].shown());
             let found = format!("{} Gaussians", counts[other]);
-            return Err(Error::input(&frames.paths()[other], "element vertex", expected, found)
+            let shown = &frames.shown_paths()[other];
+            let place = if *shown == frames.paths()[other] { "element vertex" } else { "" };
+            return Err(Error::input(shown, place, expected, found)
                 .hint("every frame must hold the same Gaussians in the same order, unless they are linked (--link)"));
         }
         let info = SequenceInfo {

@@ -93,7 +93,7 @@ enum FrameOrder {
 /// Frames with different numbers of Gaussians have no common order.
 fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
     if let Some(other) = frames.first_differing_frame() {
-        let (counts, name) = (frames.gaussian_counts(), shown_name(&frames.paths()[other]));
+        let (counts, name) = (frames.gaussian_counts(), shown_name(&frames.shown_paths()[other]));
         return Ok(FrameOrder::Lost(format!("{name} has {} Gaussians, the first frame {}", counts[other], counts[0])));
     }
     let pairs = frames.paths().len() - 1;

@@ -151,7 +151,7 @@ impl StillFiles {
             }
             write_inria(&gaussians, &[], &scratch.path().join(format!("frame_{frame:05}.ply")))?;
         }
-        let frames = PlyFrames::open(scratch.path(), &options.ply())?;
+        let frames = PlyFrames::open(scratch.path(), &options.ply())?.with_shown_paths(paths.clone());
         let opened = open_frames(frames, path, options)?;
         Ok(opened.wrapped(|inner| Box::new(StillFiles { inner, scratch, paths, kind: format.kind })))
     }

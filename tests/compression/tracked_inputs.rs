@@ -97,6 +97,23 @@ fn stream_that_is_not_linked_needs_equal_frames() {
 }
 
 #[test]
+fn messages_name_the_files_of_the_user() {
+    let workplace = Workplace::new();
+    for t in 0..3 {
+        workplace.ply(&format!("{t}.ply"), &frame(60 - t, t));
+        workplace.done(&format!("convert {t}.ply still/frame_{t}.sog").replace("still/", "still_"));
+    }
+    fs::create_dir(workplace.path("still")).unwrap();
+    (0..3).for_each(|t| {
+        let name = format!("frame_{t}.sog");
+        fs::rename(workplace.path(&format!("still_{name}")), workplace.path("still").join(name)).unwrap();
+    });
+    let linked = workplace.run("convert still out.gseq");
+    assert!(linked.stderr.contains("frame_1.sog has 59 Gaussians"), "{}", linked.stderr);
+    workplace.refused(1, "convert still other.gseq --link never", &["still/frame_1.sog", "as in still/frame_0.sog"]);
+}
+
+#[test]
 fn evaluation_notes_which_model_was_tracked() {
     let workplace = Workplace::new();
     for t in 0..12 {

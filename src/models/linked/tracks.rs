@@ -109,7 +109,7 @@ impl LinkingResult {
             notes.push(format!("{} links were ambiguous and not made: each begins a new track instead", self.doubtful));
         }
         if let Some(&first) = self.cuts.first() {
-            let name = tracks.frames.paths()[first].file_name().unwrap_or_default().shown();
+            let name = tracks.frames.shown_paths()[first].file_name().unwrap_or_default().shown();
             notes.push(match self.cuts.len() {
                 1 => format!("a cut at {name}: it shows nothing of the frame before, so all tracks end there"),
                 cuts => format!(
