@@ -82,9 +82,9 @@ impl RunPlan {
     /// - also, SH coefficients above degree 0 are not refined;
     /// - nothing is refined.
     ///
-    /// If none of them fits, returns the plan with full refinement. It is refused later with an error that names the
-    /// smallest sufficient limit. The plan includes the measurement of the quality of the result, and the refinement of
-    /// a result for the quantization of its archive, if there is memory for them.
+    /// If none of them fits, returns the plan that takes the least memory. It is refused later with an error that names
+    /// the smallest sufficient limit. The plan includes the measurement of the quality of the result, and the refinement
+    /// of a result for the quantization of its archive, if there is memory for them.
     ///
     /// # Errors
     /// Fails in the cases in which [`RunPlan::new`] fails.
@@ -130,7 +130,9 @@ impl RunPlan {
             return Ok(low_degree);
         }
         let unrefined = with(MemoryFallback::WithoutRefinement { required_bytes: least(&low_degree) })?;
-        Ok(if fits(&unrefined) { unrefined } else { full_plan })
+        // None fits: the error names the memory of the smallest plan.
+        let smallest = [unrefined, low_degree, constant, full_plan].into_iter().min_by_key(least);
+        smallest.ok_or_else(|| Error::internal("no plan"))
     }
 
     fn empty(measure: MeasureStages, gaussians: usize) -> RunPlan {
@@ -464,8 +466,8 @@ mod tests {
         let (spared, refine, _, named) = within(bands - 1);
         assert_eq!((spared, refine), (MemoryFallback::WithoutRefinement { required_bytes: bands }, None));
         assert!(named.unwrap().contains(&format!("{}MiB", bands.div_ceil(1 << 20))));
-        // With a limit below all reduced plans, the full plan is returned, which is refused later.
-        assert_eq!(within(1 << 20).0, MemoryFallback::Nothing);
+        // With a limit below all reduced plans, the smallest plan is returned, which is refused later.
+        assert_eq!(within(1 << 20).0, MemoryFallback::WithoutRefinement { required_bytes: bands });
     }
 
     #[test]
