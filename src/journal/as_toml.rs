@@ -60,6 +60,7 @@ mod tests {
             let (name, held_views) = ("min_psnr".to_owned(), vec!["t000_between".to_owned()]);
             same(&GoalSummary {
                 name,
+                is_met: false,
                 asked: 30.0,
                 before_conversion: true,
                 searched: odd,

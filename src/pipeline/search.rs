@@ -24,8 +24,10 @@ use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN};
+use crate::metrics::PSNR_CAP_DB;
 use crate::model::{Attributes, FrameView};
 use crate::outputs::kind::{Fidelity, OutputKind};
+use crate::progress::Message;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::prune_steps::PrunedModels;
@@ -57,6 +59,8 @@ const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
 /// The search ends if the surplus of quality (quality above the requested one) is at most this value. Unit: halvings of
 /// the number of Gaussians; with a surplus of 1, about half as many Gaussians would suffice.
 const MAX_SURPLUS: f64 = 0.03;
+/// Start of the note about a requested quality that no tried model has.
+const UNREACHED: &str = "the requested quality is not reached";
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
 /// Number n: one of every n views with photographs is held back from the search, to measure the quality that is
@@ -102,7 +106,9 @@ impl SearchStage {
         let Planning { request, output, .. } = *planning;
         let Some(Goal::Quality(quality)) = &request.goal else { return None };
         let searched = match quality {
-            Quality::Psnr(least) if output == OutputKind::Archive => Quality::Psnr(least + ARCHIVE_HEADROOM),
+            Quality::Psnr(least) if output == OutputKind::Archive => {
+                Quality::Psnr((least + ARCHIVE_HEADROOM).min(PSNR_CAP_DB))
+            }
             other => other.clone(),
         };
         let field = FieldPrecisionStage::from_request(request, output).map(|stage| stage.margin);
@@ -201,17 +207,24 @@ impl SearchStage {
             let held = self.value(&meter, &*result, scene, true)?;
             let summary = self.summary(&best, held, meter.held_back_names(), tried);
             drop(result);
-            let (count, is_met) = (best.result.len(), self.surplus(summary.searched) >= 0.0);
+            let count = best.result.len();
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             (journal.refined, journal.photographs) = (best.journal.refined, best.journal.photographs);
-            journal.notes.push(note(&summary, meter.search_view_count(), count, is_met));
+            journal.notes.push(self.note(&summary, meter.search_view_count(), count));
             Ok(((best.result, AsToml(summary)), count))
         });
         let (result, AsToml(mut goal)) = found?;
         if let Quality::Psnr(least) = self.quality {
             goal.asked = least;
+        }
+        let notes = &mut run.journal.notes;
+        if let Some(at) = notes.iter().rposition(|note| note.starts_with(UNREACHED)).filter(|_| !goal.is_met) {
+            // The summary shows only its first notes.
+            let note = notes.remove(at);
+            scene.events.send(Message::Warning(&note));
+            notes.insert(0, note);
         }
         (run.result, run.goal) = (result, Some(goal));
         Ok(())
@@ -404,23 +417,36 @@ impl SearchStage {
 
     fn summary(&self, best: &TriedSize, held: f64, held_views: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
         let (name, asked, before_conversion) = (self.name().to_owned(), self.goal(), self.before_conversion);
-        GoalSummary { name, asked, before_conversion, searched: best.value, held, held_views, tried }
+        let is_met = self.surplus(best.value) >= 0.0;
+        GoalSummary { name, is_met, asked, before_conversion, searched: best.value, held, held_views, tried }
     }
-}
 
-/// Returns a note for display about the result of the search. `searched`: number of views that the search used.
-/// `gaussians`: number of Gaussians in the result. `is_met`: whether the result has the requested quality.
-fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) -> String {
-    let GoalSummary { name, asked, searched: by_searched, held, held_views, tried, before_conversion } = summary;
-    let stage = if *before_conversion { ", before conversion to the format of the output" } else { "" };
-    let (sizes, others) = (tried.len(), held_views.len());
-    let (at, unit) = if name == "max_loss" { ("most", "dB loss against photographs") } else { ("least", "dB PSNR") };
-    let found = match is_met {
-        true => format!("{gaussians} Gaussians are the smallest of {sizes} tried sizes that reach this"),
-        false => format!("none of {sizes} tried sizes reaches this; all Gaussians that may stay are written"),
-    };
-    format!(
-        "search for at {at} {asked} {unit}: {found}; {by_searched:.2} dB on the {searched} views of the search, \
-         {held:.2} dB on {others} other views (goal.held_views in the summary){stage}"
-    )
+    /// Returns a note for display about the result of the search. `searched_views`: number of views that the search
+    /// used. `gaussians`: number of Gaussians in the result.
+    fn note(&self, summary: &GoalSummary, searched_views: usize, gaussians: usize) -> String {
+        let GoalSummary { name, is_met, asked, searched, held, held_views, tried, before_conversion } = summary;
+        let stage = if *before_conversion { ", before conversion to the format of the output" } else { "" };
+        let (sizes, held_count) = (tried.len(), held_views.len());
+        let asked = match &self.quality {
+            Quality::Psnr(least) if least < asked => {
+                format!("at least {least} dB PSNR, which is {asked} dB before quantization")
+            }
+            _ if name == "max_loss" => format!("at most {asked} dB loss against photographs"),
+            _ => format!("at least {asked} dB PSNR"),
+        };
+        let measured = format!(
+            "{searched:.2} dB on the {searched_views} views of the search, {held:.2} dB on {held_count} other views \
+             (goal.held_views in the summary){stage}"
+        );
+        match is_met {
+            true => format!(
+                "search for {asked}: {gaussians} Gaussians are the smallest of {sizes} tried sizes that reach this; \
+                 {measured}"
+            ),
+            false => format!(
+                "{UNREACHED}: none of {sizes} tried sizes has {asked}; all {gaussians} Gaussians that may stay are \
+                 written, with {measured}"
+            ),
+        }
+    }
 }

@@ -29,6 +29,9 @@ pub struct GoalSummary {
     /// Requested kind of quality: `min_psnr` (PSNR against the original) or `max_loss` (loss of PSNR against
     /// photographs), both in dB.
     pub name: String,
+    /// Whether the model has the requested quality on the views that the search used. If not, all Gaussians that may
+    /// stay were written.
+    pub is_met: bool,
     /// Requested value, dB: minimum PSNR against the original, or maximum loss of PSNR against photographs.
     pub asked: f64,
     /// Whether the quality is that of the result before it was converted to the format of the output, which stores

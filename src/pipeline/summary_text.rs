@@ -116,9 +116,10 @@ impl Summary {
             let of = if goal.name == "max_loss" { "loss against photographs" } else { "PSNR vs. original" };
             let views = goal.held_views.len();
             let stage = if goal.before_conversion { ", before conversion" } else { "" };
+            let not_reached = if goal.is_met { "" } else { " and not reached" };
             writeln!(
                 out,
-                "{:<14}  {} dB {of} asked for, {:.2} dB on {} apart from the search{stage}",
+                "{:<14}  {} dB {of} asked for{not_reached}, {:.2} dB on {} apart from the search{stage}",
                 "Target",
                 goal.asked,
                 goal.held,

@@ -61,6 +61,21 @@ fn unreachable_psnr_keeps_all_and_no_refine_holds() {
 }
 
 #[test]
+fn quality_that_is_not_reached_is_a_warning() {
+    let workplace = with_demo();
+    // Half of the Gaussians are missing in any case.
+    let run = workplace.run(&format!("compress {QUICKLY} --no-refine --drop-ids 0-399 --min-psnr 60 -o small.gseq"));
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let note = "the requested quality is not reached: none of ";
+    assert!(run.stderr.contains(&format!("warning: {note}")), "{}", run.stderr);
+    let first = run.stdout.lines().find(|line| line.starts_with("note: ")).unwrap();
+    assert!(first.contains(note) && first.contains("at least 60 dB PSNR"), "{}", run.stdout);
+    assert!(run.stdout.contains("60 dB PSNR vs. original asked for and not reached"), "{}", run.stdout);
+    let summary = fs::read_to_string(workplace.path("small.gseq.summary.json")).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&summary).unwrap()["goal"]["is_met"], false);
+}
+
+#[test]
 #[ignore = "needs time"]
 fn max_loss_compares_with_photographs() {
     let workplace = with_demo();
