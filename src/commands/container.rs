@@ -33,8 +33,8 @@ use crate::passes::FrameReaders;
 use crate::pipeline::stages::write::ENCODE_SECONDS_PER_STATE;
 use crate::pipeline::summary::InputSummary;
 use crate::scene::{
-    InputOptions, OpenedInput, first_frame_box, frame_quota, is_linked, open_cache, open_input, open_stream,
-    receive_untracked,
+    InputOptions, OpenedInput, first_frame_box, frame_quota, is_linked, no_frames_error, open_cache, open_input,
+    open_stream, receive_untracked,
 };
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
@@ -155,6 +155,9 @@ fn pack_arriving(
     let received = pack_stream(stream, staged.path(), packing, &input.events, |held| quota.count_arrived(held.len()))?;
     let container = Container::open(staged.path())?;
     let (gaussians, frames) = (container.info().count, container.info().times.len());
+    if frames == 0 && gaussians > 0 {
+        return Err(no_frames_error());
+    }
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let larger = ModelSize::from_frames(bytes).why_larger_than(&ModelSize::from_frames(received));

@@ -209,9 +209,9 @@ fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
     let dropped = all - scored.selection.ranking.order().len();
     let found = match dropped {
         0 => format!("none of {all}"),
-        _ => format!("none of {all}, {dropped} of which --drop-ids or --set non_finite=drops"),
+        _ => format!("none of {all}, {dropped} of which --drop-ids or --set non_finite=drop removed"),
     };
-    Error::input(&scene.path, "", "at least one Gaussian that stays", found)
+    Error::input(scene.shown_path(), "", "at least one Gaussian that stays", found)
         .hint("nothing was written: drop fewer, or ask for a size with --ratio")
 }
 

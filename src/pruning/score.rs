@@ -239,7 +239,7 @@ fn refuse_non_finite(scene: &Scene, rows: &StatisticRows) -> Result<()> {
     }
     let place = format!("Gaussian {}", first_of(&ids, ids.len()));
     let found = format!("NaN or infinity in {} of {} Gaussians", ids.len(), rows.len());
-    Err(Error::input(&scene.path, place, "finite values in every frame", found).hint(
+    Err(Error::input(scene.shown_path(), place, "finite values in every frame", found).hint(
         "at most 1% of such Gaussians are left out without asking; --set non_finite=drop removes any number of \
              them, --set non_finite=keep leaves them as they are",
     ))
@@ -269,7 +269,7 @@ fn check_views(scene: &Scene, rows: &StatisticRows) -> Result<()> {
             "{}: none of the {alive} living Gaussians of {} is in any of its {} views\n  \
              give the cameras of this scene",
             scene.rig.origin,
-            scene.path.shown(),
+            scene.shown_path().shown(),
             scene.schedule.pair_count()
         )));
     }

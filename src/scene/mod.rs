@@ -13,7 +13,7 @@ pub mod views_between;
 pub mod views_outside;
 mod work;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::cache::Cache;
 use crate::error::{Error, Result};
@@ -29,7 +29,8 @@ pub use compressed::{check_compressed, open_compressed};
 pub use input::{InputOptions, OpenedInput, UntrackedInput, with_cameras};
 pub use open::{first_frame_box, from_input, open_input, open_scene, open_untracked, scratch_beside};
 pub use stream::{
-    FrameQuota, frame_quota, is_linked, load_stream_cameras, open_stream, receive_untracked, receiving_estimate,
+    FrameQuota, frame_quota, is_linked, load_stream_cameras, no_frames_error, open_stream, receive_untracked,
+    receiving_estimate,
 };
 pub(crate) use work::add_file_stamps;
 pub use work::open_cache;
@@ -80,6 +81,11 @@ pub struct Scene {
 }
 
 impl Scene {
+    /// Returns the name of the input in messages: its path, or "standard input".
+    pub fn shown_path(&self) -> &Path {
+        stream::shown_input(&self.path)
+    }
+
     /// Creates the scene of `input` and the cameras of `rig`, with the views of `split` (`None`: of all splits) and
     /// without memory limits.
     ///

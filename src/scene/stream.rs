@@ -20,6 +20,16 @@ use crate::statistics;
 /// Name of standard input in messages to the user.
 const STANDARD_INPUT: &str = "standard input";
 
+/// Returns the name by which messages call the input at `path`.
+pub(super) fn shown_input(path: &Path) -> &Path {
+    if path == Path::new("-") { Path::new(STANDARD_INPUT) } else { path }
+}
+
+/// Returns the error for a stream with Gaussians but without frames.
+pub fn no_frames_error() -> Error {
+    Error::input(Path::new(STANDARD_INPUT), "", "at least one frame", "the end of the stream")
+}
+
 /// Opens standard input as a stream of frames.
 ///
 /// # Errors
@@ -95,7 +105,8 @@ fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Rec
 }
 
 /// Returns whether Gaussians of successive frames are linked into tracks (Gaussians followed through frames): if the
-/// frames share no Gaussian ids, or if the user asks for it.
+/// frames share no Gaussian ids, or if the user asks for it. Never if the user takes the same index to mean the same
+/// Gaussian.
 pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
     let is_needed = header.is_unlinked && options.link != LinkMode::Never;
     is_needed || options.link.links_frames_always()

@@ -97,6 +97,26 @@ fn stream_that_is_not_linked_needs_equal_frames() {
 }
 
 #[test]
+fn stream_without_frames_is_refused() {
+    let workplace = Workplace::new();
+    let mut bytes = header(1, 5);
+    bytes.extend(b"DONE");
+    bytes.extend([0; 20]);
+    let output = workplace.piped("convert - out.gseq", &bytes);
+    assert!(stderr_text(&output).contains("standard input: expected at least one frame"), "{}", stderr_text(&output));
+    assert!(!workplace.path("out.gseq").exists());
+}
+
+#[test]
+fn errors_of_values_name_standard_input() {
+    let workplace = Workplace::new();
+    let mut bad = frame(40, 0);
+    (0..20).for_each(|i| bad.position.set_row(i, [f32::NAN; 3]));
+    let output = workplace.piped("compress - -o out.gseq --link never", &stream(&[bad, frame(40, 1)]));
+    assert!(stderr_text(&output).contains("standard input, Gaussian 0"), "{}", stderr_text(&output));
+}
+
+#[test]
 fn messages_name_the_files_of_the_user() {
     let workplace = Workplace::new();
     for t in 0..3 {

@@ -255,7 +255,7 @@ pub(crate) fn check_met(
         true => Err(Error::usage(format!(
             "{}: the values of an archive of this model would be too coarse: expected {expected}{required_psnr:.1} dB \
              PSNR against renders before quantization, found {found}\n  {cause}",
-            scene.path.shown()
+            scene.shown_path().shown()
         ))),
         false => Ok(Some(format!(
             "the archive misses its quality: expected {expected}{required_psnr:.1} dB PSNR against renders before \
