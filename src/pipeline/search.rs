@@ -17,7 +17,7 @@ use super::stages::bands::ShDegreeStage;
 use super::stages::choose;
 use super::stages::field::FieldPrecisionStage;
 use super::stages::reference_views::ARCHIVE_HEADROOM;
-use super::summary::GoalSummary;
+use super::summary::{GoalSummary, UNREACHED};
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
@@ -59,8 +59,6 @@ const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
 /// The search ends if the surplus of quality (quality above the requested one) is at most this value. Unit: halvings of
 /// the number of Gaussians; with a surplus of 1, about half as many Gaussians would suffice.
 const MAX_SURPLUS: f64 = 0.03;
-/// Start of the note about a requested quality that no tried model has.
-const UNREACHED: &str = "the requested quality is not reached";
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
 /// Number n: one of every n views with photographs is held back from the search, to measure the quality that is

@@ -23,14 +23,17 @@ use crate::pruning::SelectionCounts;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
 
+/// Start of the note about a requested quality that the result does not have.
+pub(super) const UNREACHED: &str = "the requested quality is not reached";
+
 /// Result of the search for the smallest model with a requested quality.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GoalSummary {
     /// Requested kind of quality: `min_psnr` (PSNR against the original) or `max_loss` (loss of PSNR against
     /// photographs), both in dB.
     pub name: String,
-    /// Whether the model has the requested quality on the views that the search used. If not, all Gaussians that may
-    /// stay were written.
+    /// Whether the output, or the model before its conversion (`before_conversion`), has the requested quality on the
+    /// views that the search used.
     pub is_met: bool,
     /// Requested value, dB: minimum PSNR against the original, or maximum loss of PSNR against photographs.
     pub asked: f64,

@@ -76,6 +76,16 @@ fn quality_that_is_not_reached_is_a_warning() {
 }
 
 #[test]
+fn archive_that_misses_the_quality_is_a_warning() {
+    let workplace = with_demo();
+    // Renders of all Gaussians before quantization are equal to those of the original, which counts as 100 dB.
+    let run = workplace.run(&format!("compress {QUICKLY} --no-refine --min-psnr 99.99 -o small.gsz"));
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    assert!(run.stderr.contains("warning: the requested quality is not reached: quantization costs"), "{}", run.stderr);
+    assert!(run.stdout.contains("99.99 dB PSNR vs. original asked for and not reached"), "{}", run.stdout);
+}
+
+#[test]
 #[ignore = "needs time"]
 fn max_loss_compares_with_photographs() {
     let workplace = with_demo();

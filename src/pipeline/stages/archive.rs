@@ -31,7 +31,8 @@ use crate::pipeline::stages::reference_views::{
     ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_PER_PIXEL, ENOUGH_PSNR,
     OCTAVE_HALVINGS, QualityTarget, ReferenceViews, check_measurable, check_met, view_count,
 };
-use crate::pipeline::summary::ArchiveSummary;
+use crate::pipeline::summary::{ArchiveSummary, UNREACHED};
+use crate::progress::Message;
 use crate::refinement::RefineStage;
 use crate::render;
 use crate::scene::Scene;
@@ -42,6 +43,9 @@ const NAME: &str = "archive";
 /// number of octaves (doublings). The estimate decides how many Gaussians a result of at most `--size` bytes keeps;
 /// with this value, quantization then costs 0.5 and 1.2 dB PSNR on two trained models.
 const ESTIMATE_OCTAVES: f64 = 3.3;
+
+/// Maximum amount, dB, by which an archive may miss the requested PSNR without a warning: rounding of measured PSNRs.
+const MAX_MISSED_PSNR: f64 = 0.01;
 
 /// Name, in notes about omitted work, of the refinement for the quantization of an archive.
 const REFINEMENT: &str = "refinement of quantized values";
@@ -100,11 +104,20 @@ impl Stage for ArchiveStage {
             (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
             let what =
                 if archive.is_refined { "quantization and refinement for it cost" } else { "quantization costs" };
-            run.journal.notes.push(format!(
-                "archive: {what} {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at \
-                 least {} dB PSNR requested, {:.2} dB on the views of the search, {:.2} dB on the other views",
+            let text = format!(
+                "{what} {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at least {} dB PSNR \
+                 requested, {:.2} dB on the views of the search, {:.2} dB on the other views",
                 archive.loss, goal.asked, goal.searched, goal.held
-            ));
+            );
+            if goal.is_met && goal.searched < goal.asked - MAX_MISSED_PSNR {
+                goal.is_met = false;
+                let note = format!("{UNREACHED}: {text}");
+                run.scene.events.send(Message::Warning(&note));
+                // The summary shows only its first notes.
+                run.journal.notes.insert(0, note);
+            } else {
+                run.journal.notes.push(format!("archive: {text}"));
+            }
         }
         (run.archived, run.archive) = (Some(archived), Some(archive));
         Ok(())
