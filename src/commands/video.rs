@@ -96,7 +96,11 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
     let own = views_with_times(&mut opened, options.input.frames.is_some());
     let mut scene = from_input(opened, &InputOptions { split: None, ..options.input.clone() })?;
-    let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
+    let mut notes = std::mem::take(&mut scene.notes);
+    let beside = match options.beside.as_deref() {
+        Some(path) => Some(open_compressed(path, &scene, &options.input, &mut notes)?),
+        None => None,
+    };
     let models = 1 + u64::from(beside.is_some());
     scene.plan_memory(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
         // Bytes per pixel and model, besides the render: the joined frame (12), its 8-bit values (3) and, for a GIF,
@@ -121,7 +125,7 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     }
     film.finish()?;
     staged.commit()?;
-    Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
+    Ok(VideoReport { frames: views.len(), size, notes })
 }
 
 /// Removes the times from the views (pairs of a camera and a time) of `opened`, so that every camera can show every

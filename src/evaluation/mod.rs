@@ -182,8 +182,10 @@ impl ModelPair {
     /// Fails if inputs, cameras or the folder of photographs cannot be read, or if the models have different frames.
     pub fn open(options: &EvaluateOptions) -> Result<ModelPair> {
         check_compressed(&options.compressed)?;
-        let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
-        let compressed = open_compressed(&options.compressed, &scene, &options.original)?;
+        let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
+        let mut notes = std::mem::take(&mut scene.notes);
+        let compressed = open_compressed(&options.compressed, &scene, &options.original, &mut notes)?;
+        scene.notes = notes;
         let background = render_background(options.background, &scene)?;
         let times = &scene.source().info().times;
         let mut chosen = select_views(&scene.rig, times, options.views)?;

@@ -153,6 +153,13 @@ pub trait InputModel: Send + Sync {
         DEFAULT_OUTPUT
     }
 
+    /// Returns whether a `.splatv` file of this input stores the Gaussians of the input, at the times of the input. For
+    /// all other inputs it stores curves fitted to the frames, at times from 0 to 1
+    /// ([`scale_to_unit`](crate::outputs::curves::scale_to_unit)).
+    fn is_splatv_at_own_times(&self) -> bool {
+        false
+    }
+
     /// Checks that this input can be written as `kind` to `path`.
     ///
     /// # Errors

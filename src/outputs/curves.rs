@@ -52,7 +52,9 @@ pub fn write_fitted_splatv(source: &dyn FrameSource, path: &Path, events: &Event
 
 /// Returns `times` unchanged if all of them are in the range from 0 to 1. Otherwise scales them, so that the first
 /// becomes 0 and the last 1.
-fn scale_to_unit(times: &[f64]) -> Vec<f64> {
+///
+/// A `.splatv` file that is made from a sequence with the frame times `times` stores its motion at the returned times.
+pub fn scale_to_unit(times: &[f64]) -> Vec<f64> {
     match (times.first(), times.last()) {
         (Some(&first), Some(&last)) if first < 0.0 || last > 1.0 => {
             let span = if last > first { last - first } else { 1.0 };

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
-use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
+use crate::model::{Attributes, NO_SH_LIMIT};
 use crate::models::InputModel;
 use crate::player::page::{ChunkFiles, INDEX_FILE, PageModelInfo, PageScene, cameras, mean_up, training_rig};
 use crate::player::poster::{self, render_poster};
@@ -107,8 +107,11 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     if scene.source().info().times.is_empty() {
         return Err(Error::input(&options.original.path, "", "at least one frame to show", "none"));
     }
-    let compressed =
-        options.compressed.as_deref().map(|path| open_compressed(path, &scene, &options.original)).transpose()?;
+    let mut notes = std::mem::take(&mut scene.notes);
+    let compressed = match options.compressed.as_deref() {
+        Some(path) => Some(open_compressed(path, &scene, &options.original, &mut notes)?),
+        None => None,
+    };
     let background = render_background(options.background, &scene)?;
     let limits = {
         let most = compressed.as_ref().map_or(0, |model| model.source().info().count as u64);
@@ -130,11 +133,12 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
         None => (all, NO_SH_LIMIT),
     };
     let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
-    let (mut chunks, mut notes) = (ChunkFiles::new(&scratch)?, std::mem::take(&mut scene.notes));
-    let asked = ModelView { role: "original", path: &scene.path, frames, degree };
+    let mut chunks = ChunkFiles::new(&scratch)?;
+    let times = &scene.source().info().times;
+    let asked = ModelView { role: "original", path: &scene.path, times, frames, degree };
     let mut models = vec![add_model(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];
     if let Some((path, model)) = options.compressed.as_deref().zip(compressed.as_deref()) {
-        let asked = ModelView { role: "compressed", path, frames: all, degree: NO_SH_LIMIT };
+        let asked = ModelView { role: "compressed", path, times, frames: all, degree: NO_SH_LIMIT };
         models.push(add_model(model, 1, &asked, steps, &limits, &mut chunks, &scene.events)?);
     }
     for model in models.iter().filter(|model| model.track.unseen > 0) {
@@ -177,11 +181,12 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     Ok(ViewReport { page: folder.join(INDEX_FILE), bytes, files: names.len(), frames, notes })
 }
 
-/// Settings for one model on the page: its role (`original` or `compressed`), its path, the maximum number of frames
-/// and the maximum SH degree.
+/// Settings for one model on the page: its role (`original` or `compressed`), its path, the times at which its frames
+/// are shown, the maximum number of frames and the maximum SH degree.
 struct ModelView<'a> {
     role: &'static str,
     path: &'a Path,
+    times: &'a [f64],
     frames: usize,
     degree: usize,
 }
@@ -199,9 +204,10 @@ fn add_model(
     events: &Events,
 ) -> Result<PageModelInfo> {
     let source = model.source();
-    let SequenceInfo { times, sh_degree, .. } = source.info();
+    let (times, sh_degree) = (model_view.times, source.info().sh_degree);
     let frames = evenly(times.len(), model_view.frames);
     let mut track = PageSequence::plan(source, &frames, model_view.degree, steps);
+    track.times = frames.iter().map(|&frame| times[frame]).collect();
     let groups = track.groups.clone();
     encode(source, &frames, &mut track, limits.max_kept_frames, events, |chunk, bytes| {
         let since = chunk.checked_sub(1).map_or(0.0, |group| groups[group] as f64 / frames.len() as f64);
@@ -213,7 +219,7 @@ fn add_model(
         name,
         bytes: model.size()?.total(),
         frames: times.len(),
-        degree: *sh_degree,
+        degree: sh_degree,
         track,
     })
 }

@@ -6,6 +6,8 @@ use std::path::Path;
 use super::{InputOptions, Scene};
 use crate::error::{Error, Result, ShowPath};
 use crate::models::{self, InputModel, OpenOptions, TimeOrigin};
+use crate::outputs::curves::scale_to_unit;
+use crate::outputs::kind::OutputKind;
 
 /// Maximum difference between the times of the same frame in two models, as a fraction of the time span of the
 /// sequence. Times that were written to a file are rounded, so they may differ slightly.
@@ -28,11 +30,29 @@ pub fn check_compressed(path: &Path) -> Result<()> {
 /// Opens the compressed model at `path`, with frames at the times of the frames of `original`. `options` are the
 /// options with which the original was opened; the training iteration in them is ignored.
 ///
+/// A `.splatv` file that was made from frames with times outside the range from 0 to 1 stores these times scaled to
+/// this range. Such a model is opened at the scaled times, and a note that says so is added to `notes`.
+///
 /// # Errors
 /// Fails if the model cannot be read, or if the number or the times of its frames differ from the original's.
-pub fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
-    let times = &original.source().info().times;
+pub fn open_compressed(
+    path: &Path,
+    original: &Scene,
+    options: &InputOptions,
+    notes: &mut Vec<String>,
+) -> Result<Box<dyn InputModel>> {
+    let own_times = &original.source().info().times;
     let input = models::open(path, &OpenOptions { iteration: None, ..options.open_options() })?.into_linked()?;
+    let is_fitted_splatv =
+        input.default_output_kind() == OutputKind::Splatv && !original.input.is_splatv_at_own_times();
+    let times = &if is_fitted_splatv { scale_to_unit(own_times) } else { own_times.clone() };
+    if let ([first, .., last], true) = (&own_times[..], times != own_times) {
+        notes.push(format!(
+            "the times of the original, {first} to {last}, are compared with the times 0 to 1 of {}, because a .splatv \
+             holds no other times",
+            path.shown()
+        ));
+    }
     let input = match input.timing() {
         TimeOrigin::Continuous => input.with_times(times.clone())?,
         TimeOrigin::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,

@@ -6,10 +6,16 @@ use std::path::Path;
 
 use crate::scene::{Workplace, index_map, shared, state};
 use serde_json::Value;
+use splatsieve::diagnostics::demo_scene::{DemoScene, cameras_json};
+use splatsieve::error::Result;
 use splatsieve::files::splatv::write::encode_words;
 use splatsieve::files::splatv::{MAGIC, SplatvGaussian, WORDS_PER_GAUSSIAN};
-use splatsieve::model::opacity;
+use splatsieve::model::{SequenceInfo, opacity};
+use splatsieve::models::trajectories::write_sequence;
+use splatsieve::outputs::kind::OutputKind;
+use splatsieve::progress::Events;
 use splatsieve::scene::{InputOptions, open_scene};
+use splatsieve::source::{BlockReader, FrameSource, Ids};
 
 const ROWS: usize = 200;
 
@@ -194,4 +200,37 @@ fn captured_coffee_has_the_defects_that_were_counted() {
     let kinds = ["24 of 11926 rows (0.20%) left out", "11331 of 11926 rows (95.01%) left out: zero quaternion"];
     assert_said(&notes, &[total, kinds[0], kinds[1], "4 of 11926 rows (0.03%) repaired: infinite temporal width"]);
     assert_eq!(notes.len(), 5, "{notes:?}");
+}
+
+/// Test scene whose frames have other times.
+struct Retimed(DemoScene, SequenceInfo);
+
+impl FrameSource for Retimed {
+    fn info(&self) -> &SequenceInfo {
+        &self.1
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        self.0.open(ids)
+    }
+}
+
+#[test]
+fn times_outside_0_to_1_are_scaled_for_comparison() {
+    let workplace = Workplace::new();
+    let scene = DemoScene::new(300, 6);
+    let times = scene.info().times.iter().map(|time| 8.0 * time - 2.0).collect();
+    fs::write(workplace.path("cameras.json"), cameras_json(&scene.rig())).unwrap();
+    let info = SequenceInfo { times, ..scene.info().clone() };
+    let retimed = Retimed(scene, info);
+    write_sequence(&retimed, OutputKind::Gseq, &workplace.path("scene.gseq"), 1, &Events::IGNORED).unwrap();
+
+    let options = "--cameras cameras.json --prune-only --no-refine --ratio 1";
+    let summary = workplace.summary(&format!("scene.gseq -o curves.splatv {options}"));
+    let [said, measured] = [&summary, &json(&workplace, "evaluate scene.gseq curves.splatv --cameras cameras.json --json")]
+        .map(|found| found["quality"]["psnr"].as_f64().or(found["psnr"].as_f64()).unwrap());
+    assert!(summary["quality"]["before_conversion"].is_null(), "{summary}");
+    assert!((said - measured).abs() < 2.0 && measured > 30.0, "{said} dB printed, {measured} dB measured");
+    let evaluated = workplace.done("evaluate scene.gseq curves.splatv --cameras cameras.json");
+    assert!(evaluated.contains("the times of the original, -2 to 6, are compared with the times 0 to 1"), "{evaluated}");
 }

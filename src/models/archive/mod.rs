@@ -257,6 +257,10 @@ impl InputModel for OpenArchive {
         self.inner.default_output_kind()
     }
 
+    fn is_splatv_at_own_times(&self) -> bool {
+        self.inner.is_splatv_at_own_times()
+    }
+
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         self.inner.check_output(kind, path)
     }

@@ -314,6 +314,10 @@ impl InputModel for SpacetimeGaussians {
         if self.files.folder.is_some() { OutputKind::Model } else { OutputKind::Ply }
     }
 
+    fn is_splatv_at_own_times(&self) -> bool {
+        true
+    }
+
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
         match kind {
             OutputKind::Model if self.files.folder.is_none() => {

@@ -214,6 +214,10 @@ impl InputModel for SplatvModel {
         OutputKind::Splatv
     }
 
+    fn is_splatv_at_own_times(&self) -> bool {
+        true
+    }
+
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
         match kind {
             OutputKind::Model | OutputKind::Ply => Err(Error::usage(

@@ -159,21 +159,17 @@ impl QualityStage {
     }
 
     /// Opens the output that was written to `path`, as a copy in a scratch folder with the ending of its kind. Returns
-    /// `None` for outputs that are not read back: those of [`QualityStage::reads_no_output`], and a `.splatv` of frames
-    /// with times outside the range from 0 to 1, because it stores times scaled to this range.
+    /// `None` for the outputs of [`QualityStage::reads_no_output`].
     ///
     /// # Errors
     /// Fails if the output cannot be copied or read.
     fn open_output(&self, scene: &Scene, path: &Path) -> Result<Option<(ScratchFolder, Box<dyn InputModel>)>> {
-        let has_scaled_times = || scene.source().info().times.iter().any(|time| !(0.0..=1.0).contains(time));
-        let ending = self.kind.ending().filter(|_| !self.reads_no_output());
-        let Some(ending) = ending.filter(|_| self.kind != OutputKind::Splatv || !has_scaled_times()) else {
-            return Ok(None);
-        };
+        let Some(ending) = self.kind.ending().filter(|_| !self.reads_no_output()) else { return Ok(None) };
         let folder = ScratchFolder::new(&scene.scratch)?;
         let copy = folder.path().join(format!("result.{ending}"));
         fs::copy(path, &copy).map_err(Error::io("copy", path))?;
-        let output = open_compressed(&copy, scene, &self.input)?;
+        // The path of the copy, which the notes name, means nothing to the user.
+        let output = open_compressed(&copy, scene, &self.input, &mut Vec::new())?;
         Ok(Some((folder, output)))
     }
 
@@ -238,7 +234,7 @@ impl QualityStage {
                 folder = ScratchFolder::new(&scene.scratch)?;
                 let path = folder.path().join("result.gsz");
                 fs::write(&path, &encoded.bytes).map_err(Error::io("write", &path))?;
-                opened = open_compressed(&path, scene, &self.input)?;
+                opened = open_compressed(&path, scene, &self.input, &mut Vec::new())?;
                 opened.source()
             }
             // Frames with error bounds exist only once they are written.
