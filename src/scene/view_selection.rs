@@ -45,18 +45,26 @@ pub(crate) fn distinct_views(rig: &Rig, views: impl Iterator<Item = FrameView>) 
     found.dedup();
     match found.windows(2).find(|pair| (pair[0].frame, pair[0].view) == (pair[1].frame, pair[1].view)) {
         None => Ok(found),
-        Some(pair) => Err(Error::usage(format!(
-            "{}: two cameras are view {} at frame {}\n  choose one part with --split train or --split test",
-            rig.origin, pair[0].view, pair[0].frame
-        ))),
+        Some(pair) => {
+            let hint = match &splits_with_views(rig)[..] {
+                [] | [_] => "correct the camera file: a view number may occur only once per frame".to_owned(),
+                splits => format!("choose one part with --split {}", splits.join(" or --split ")),
+            };
+            let FrameView { frame, view, .. } = pair[0];
+            Err(Error::usage(format!("{}: two cameras are view {view} at frame {frame}\n  {hint}", rig.origin)))
+        }
     }
+}
+
+/// Returns the names of the splits (training, validation, test) that have views in `rig`.
+fn splits_with_views(rig: &Rig) -> Vec<&'static str> {
+    let has_views = |split: &Split| rig.views.iter().any(|rig_view| rig_view.split == *split);
+    [Split::Train, Split::Val, Split::Test].into_iter().filter(has_views).map(Split::name).collect()
 }
 
 /// Returns the error that the chosen split has no views. It names the splits of `rig` that have some.
 pub fn no_view_error(rig: &Rig) -> Error {
-    let has = |split: &Split| rig.views.iter().any(|rig_view| rig_view.split == *split);
-    let splits = [Split::Train, Split::Val, Split::Test];
-    let available: Vec<&str> = splits.iter().filter(|split| has(split)).map(|split| split.name()).collect();
+    let available = splits_with_views(rig);
     Error::usage(format!(
         "{}: the cameras have no views in this split\n  they have views of {}; use --split {} or --split all",
         rig.origin,
@@ -253,7 +261,10 @@ mod tests {
         assert_eq!(pairs(&select_views(&same, &[0.0], ViewSet::All).unwrap()), [(0, 3)]);
         let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
         let message = select_views(&two, &[0.0], ViewSet::All).unwrap_err().to_string();
-        assert!(message.contains("view 3 at frame 0") && message.contains("--split"), "{message}");
+        assert!(message.contains("view 3 at frame 0") && message.contains("--split train or --split test"), "{message}");
+        let in_one_split = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Train)]);
+        let message = select_views(&in_one_split, &[0.0], ViewSet::All).unwrap_err().to_string();
+        assert!(message.contains("correct the camera file") && !message.contains("--split"), "{message}");
     }
 
     #[test]

@@ -193,10 +193,11 @@ impl RigBuilder {
             let end = self.files.get(k + 1).map_or(rig_views.len(), |next| next.1);
             let mut view_indices: HashTable<u32> = HashTable::new();
             for at in *first..end {
-                let Some(key) = view_key(at) else { continue };
+                let key = view_key(at);
+                let Some((view, _, time)) = key else { continue };
                 let hash = self.hasher.hash_one(key);
-                if let Some(&earlier) = view_indices.find(hash, |&other| view_key(other as usize) == Some(key)) {
-                    let (view, time) = (key.0, f64::from_bits(key.2));
+                if let Some(&earlier) = view_indices.find(hash, |&other| view_key(other as usize) == key) {
+                    let time = f64::from_bits(time);
                     return Err(Error::input(
                         path,
                         place(Some(at - first)),

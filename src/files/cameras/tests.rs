@@ -98,6 +98,14 @@ fn negative_zero_and_zero_give_the_same_camera() {
 }
 
 #[test]
+fn a_view_given_twice_is_refused_among_many_views() {
+    let mut times: Vec<f64> = (0..200).map(f64::from).collect();
+    assert_eq!(load_json("cameras.json", &per_image(&times)).unwrap().views.len(), 200);
+    times.push(7.0);
+    assert_refused("cameras.json", &per_image(&times), &["frame 200", "one image per view", "again, as in frame 7"]);
+}
+
+#[test]
 #[ignore = "needs the trained models"]
 fn transforms_and_cameras_json_give_the_same_cameras() {
     for model in shared_models() {
