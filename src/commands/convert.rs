@@ -86,7 +86,7 @@ pub fn convert(
     plan.send_stage_times(input.memory.tell, &input.events);
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
-    notes.extend(kind.motion_note(frames).map(str::to_owned));
+    notes.extend(model.motion_note(kind).map(str::to_owned));
     let mut write = |path: &Path| -> Result<ModelSize> {
         notes.extend(model.write(&all, kind, path, &plan.limits, &input.events)?);
         model.size_written(kind, path)
@@ -108,7 +108,7 @@ pub fn convert(
         staged.commit()?;
         size
     };
-    let frames = if kind.motion_note(frames).is_some() { 1 } else { frames };
+    let frames = if model.motion_note(kind).is_some() { 1 } else { frames };
     let (bytes, larger) = (size.total(), size.why_larger_than(&model.size()?));
     Ok(ConvertReport { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger, notes })
 }

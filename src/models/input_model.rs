@@ -153,11 +153,21 @@ pub trait InputModel: Send + Sync {
         DEFAULT_OUTPUT
     }
 
-    /// Returns whether a `.splatv` file of this input stores the Gaussians of the input, at the times of the input. For
-    /// all other inputs it stores curves fitted to the frames, at times from 0 to 1
-    /// ([`scale_to_unit`](crate::outputs::curves::scale_to_unit)).
-    fn is_splatv_at_own_times(&self) -> bool {
-        false
+    /// Returns whether an output of the kind `kind` stores the motion of this model itself, in the model's own time
+    /// unit, instead of frames or of motion that is fitted to frames.
+    fn keeps_motion(&self, kind: OutputKind) -> bool {
+        match kind {
+            OutputKind::Model => true,
+            OutputKind::Archive => !self.archives_as_frames(),
+            _ => false,
+        }
+    }
+
+    /// Returns a note for the user if an output of the kind `kind` leaves out the motion of this model: if it stores
+    /// the Gaussians before any motion, although the model has several frames.
+    fn motion_note(&self, kind: OutputKind) -> Option<&'static str> {
+        let _ = kind;
+        None
     }
 
     /// Checks that this input can be written as `kind` to `path`.

@@ -9,7 +9,7 @@ use std::path::Path;
 use gseq::Compression;
 
 use crate::compressed_model::{CompressedModel, TrajectoryDelta};
-use crate::error::{Error, Result, ShowPath};
+use crate::error::{Error, Result};
 use crate::files::glb::write::write_glb;
 use crate::files::ply::write::write_inria;
 use crate::files::sog::write::{SogErrors, visible_only, write_sog};
@@ -22,7 +22,7 @@ use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, wr
 use crate::outputs::curves::write_fitted_splatv;
 use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::gsd::write_gsd;
-use crate::outputs::kind::OutputKind;
+use crate::outputs::kind::{OutputKind, too_many_frames};
 use crate::outputs::time_windows::write_fitted_windows;
 use crate::passes::{FrameStates, FramesInMemory, SourceWithDeltas, gather_all};
 use crate::progress::Events;
@@ -67,10 +67,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
         OutputKind::Model => Err(Error::usage(
             "only a trained model can be written as a model folder\n  write a .gseq or --as ply-sequence",
         )),
-        OutputKind::Ply if frames != 1 => Err(Error::usage(format!(
-            "{}: {frames} frames do not fit one .ply\n  write a .gseq or --as ply-sequence",
-            path.shown()
-        ))),
+        OutputKind::Ply if frames != 1 => Err(too_many_frames(frames, "ply", "a .gseq or --as ply-sequence", path)),
         OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
         _ => Ok(()),
     }

@@ -19,7 +19,8 @@ pub enum OutputKind {
     Gseq,
     /// A folder with one PLY per frame.
     PlySequence,
-    /// One PLY file: the canonical Gaussians of a model, or a sequence of one frame.
+    /// One PLY file: a single frame; of a 4DGaussians model with several frames its canonical Gaussians, of a
+    /// SpacetimeGaussians model all stored values with the motion.
     Ply,
     /// A `.gsz` archive for storage and transfer. For a sequence of frames it is a container with error bounds.
     Archive,
@@ -171,13 +172,6 @@ impl OutputKind {
         }
     }
 
-    /// Returns a note for the user if this kind of output leaves out the motion of a model with `frames` frames: a
-    /// `.ply` holds the stored Gaussians of a model, before any motion.
-    pub fn motion_note(self, frames: usize) -> Option<&'static str> {
-        let leaves_out = self == OutputKind::Ply && frames > 1;
-        leaves_out.then_some("a .ply holds the Gaussians of the model without its motion")
-    }
-
     /// Returns the number of bytes of memory per Gaussian that encoding one frame takes, besides the frame itself.
     /// `state_bytes` is the number of bytes of the attributes of one Gaussian.
     pub fn encoding_bytes(self, state_bytes: u64) -> u64 {
@@ -195,14 +189,7 @@ impl OutputKind {
     /// # Errors
     /// Fails for a `.spz`, a `.sog` or a `.glb` file if the number of frames is not 1.
     pub fn check_frames(self, frames: usize, path: &Path) -> Result<()> {
-        let too_many = |ending: &str, others: &str| {
-            let path = path.shown();
-            Err(Error::usage(format!(
-                "{path}: {frames} frames do not fit one .{ending}\n  write {others}\n  \
-                 for one frame of a model: convert with --frames 1; of frames: write them with --as ply-sequence, and \
-                 convert one of the files"
-            )))
-        };
+        let too_many = |ending: &str, others: &str| Err(too_many_frames(frames, ending, others, path));
         match self {
             _ if frames == 1 => Ok(()),
             OutputKind::Spz | OutputKind::Spz4 => too_many("spz", "a .splatv, a .4dgs or a .gseq"),
@@ -211,6 +198,17 @@ impl OutputKind {
             _ => Ok(()),
         }
     }
+}
+
+/// Returns the error that `frames` frames do not fit one file with the ending `ending` at `path`. `others`: outputs
+/// that can hold them.
+pub fn too_many_frames(frames: usize, ending: &str, others: &str, path: &Path) -> Error {
+    Error::usage(format!(
+        "{}: {frames} frames do not fit one .{ending}\n  write {others}\n  \
+         for one frame of a model: convert with --frames 1; of frames: write them with --as ply-sequence, and \
+         convert one of the files",
+        path.shown()
+    ))
 }
 
 /// Checks that `path` can be the name of an output folder. `what` is the command that writes the folder, for messages.

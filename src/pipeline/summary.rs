@@ -234,6 +234,9 @@ pub struct Summary {
     /// is not written to files.
     #[serde(skip)]
     pub given_cameras: Option<PathBuf>,
+    /// Whether the output leaves out the motion of the model. Not written to files.
+    #[serde(skip)]
+    pub leaves_out_motion: bool,
     /// Whether the output has a format that this program does not read. Not written to files.
     #[serde(skip)]
     pub is_unreadable: bool,

@@ -216,10 +216,10 @@ impl Summary {
         let [original, result] = [Path::new(&self.input.path), output].map(shell_word);
         let page = beside(".html");
         let kind = OutputKind::from_path(output, None, OutputKind::Model);
-        match kind.motion_note(self.input.frames.unwrap_or(1)) {
+        match self.leaves_out_motion {
             // A still cannot be shown beside a model with other frames.
-            Some(_) => writeln!(out, "\nSee it:   splatsieve view {result} -o {page}")?,
-            None => writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}")?,
+            true => writeln!(out, "\nSee it:   splatsieve view {result} -o {page}")?,
+            false => writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}")?,
         }
         if kind == OutputKind::Model && self.output_size.field > 0 {
             writeln!(out, "Smaller:  -o {} writes an archive, which unpacks to the same folder", beside(".gsz"))?;

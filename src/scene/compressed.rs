@@ -44,7 +44,7 @@ pub fn open_compressed(
     let own_times = &original.source().info().times;
     let input = models::open(path, &OpenOptions { iteration: None, ..options.open_options() })?.into_linked()?;
     let is_fitted_splatv =
-        input.default_output_kind() == OutputKind::Splatv && !original.input.is_splatv_at_own_times();
+        input.default_output_kind() == OutputKind::Splatv && !original.input.keeps_motion(OutputKind::Splatv);
     let times = &if is_fitted_splatv { scale_to_unit(own_times) } else { own_times.clone() };
     if let ([first, .., last], true) = (&own_times[..], times != own_times) {
         notes.push(format!(

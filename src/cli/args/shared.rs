@@ -220,7 +220,8 @@ pub(in crate::cli) enum OutputKindArg {
     Gseq,
     /// Folder with one PLY file per frame
     PlySequence,
-    /// One PLY file: the canonical Gaussians of a model, or a single frame
+    /// One PLY file: a single frame; of 4DGaussians also the canonical Gaussians, of SpacetimeGaussians
+    /// the model with its motion
     Ply,
     /// Archive (.gsz), the smallest: to store and to send
     Archive,

@@ -257,8 +257,12 @@ impl InputModel for OpenArchive {
         self.inner.default_output_kind()
     }
 
-    fn is_splatv_at_own_times(&self) -> bool {
-        self.inner.is_splatv_at_own_times()
+    fn keeps_motion(&self, kind: OutputKind) -> bool {
+        self.inner.keeps_motion(kind)
+    }
+
+    fn motion_note(&self, kind: OutputKind) -> Option<&'static str> {
+        self.inner.motion_note(kind)
     }
 
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {

@@ -129,6 +129,11 @@ impl InputModel for ModelFolder {
         OutputKind::Model
     }
 
+    fn motion_note(&self, kind: OutputKind) -> Option<&'static str> {
+        let leaves_out = kind == OutputKind::Ply && self.info().times.len() != 1;
+        leaves_out.then_some("a .ply holds the Gaussians of the model without its motion")
+    }
+
     fn check_output(&self, _: OutputKind, _: &Path) -> Result<()> {
         Ok(())
     }
@@ -227,7 +232,7 @@ impl InputModel for ModelFolder {
                     ));
                 }
             }
-            OutputKind::Ply => self.write_cloud(compressed, path)?,
+            OutputKind::Ply if self.motion_note(kind).is_some() => self.write_cloud(compressed, path)?,
             OutputKind::Archive => {
                 return Err(Error::internal(
                     "an archive is written from its content, not by the \

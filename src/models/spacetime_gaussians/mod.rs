@@ -314,8 +314,8 @@ impl InputModel for SpacetimeGaussians {
         if self.files.folder.is_some() { OutputKind::Model } else { OutputKind::Ply }
     }
 
-    fn is_splatv_at_own_times(&self) -> bool {
-        true
+    fn keeps_motion(&self, kind: OutputKind) -> bool {
+        matches!(kind, OutputKind::Model | OutputKind::Ply | OutputKind::Splatv | OutputKind::Archive)
     }
 
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {

@@ -214,8 +214,8 @@ impl InputModel for SplatvModel {
         OutputKind::Splatv
     }
 
-    fn is_splatv_at_own_times(&self) -> bool {
-        true
+    fn keeps_motion(&self, kind: OutputKind) -> bool {
+        matches!(kind, OutputKind::Splatv | OutputKind::Archive)
     }
 
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {

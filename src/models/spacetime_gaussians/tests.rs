@@ -229,6 +229,8 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
         assert_eq!((alone.default_output_kind(), alone.kind()), (OutputKind::Ply, model.kind()));
         assert_eq!(alone.check_output(OutputKind::Splatv, Path::new("x.splatv")).is_err(), is_full);
         assert!(alone.check_output(OutputKind::Model, Path::new("x")).is_err());
+        // Its PLY holds the motion, so no note says that it is missing.
+        assert!(model.keeps_motion(OutputKind::Ply) && model.motion_note(OutputKind::Ply).is_none());
     }
 }
 

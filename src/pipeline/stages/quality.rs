@@ -241,7 +241,7 @@ impl QualityStage {
             (None, Some(PreparedArchive::Frames(_))) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
-        let is_converted = self.kind.fidelity() != Fidelity::Exact || self.kind.motion_note(times.len()).is_some();
+        let is_converted = self.kind.fidelity() != Fidelity::Exact || scene.input.motion_note(self.kind).is_some();
         let before_conversion = written.is_none() && is_converted;
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
             let psnr = journal.result_psnr().unwrap_or(refined.result);

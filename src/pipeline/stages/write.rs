@@ -123,6 +123,7 @@ impl Stage for WriteStage {
                 cameras: CameraSummary::from_scene(run.scene),
                 output: name_of(&self.output),
                 given_cameras: run.request.input.cameras.clone(),
+                leaves_out_motion: run.scene.input.motion_note(self.kind).is_some(),
                 is_unreadable: self.kind.fidelity() == Fidelity::Unreadable,
                 gaussians: run.result.len(),
                 output_bytes: output.total(),
@@ -310,7 +311,7 @@ impl WriteStage {
                     None => {
                         let about_file =
                             scene.input.write(compressed, self.kind, path, &scene.limits, &scene.events)?;
-                        let about_motion = self.kind.motion_note(scene.source().info().times.len()).map(str::to_owned);
+                        let about_motion = scene.input.motion_note(self.kind).map(str::to_owned);
                         let mut about_file = about_motion.into_iter().chain(about_file);
                         // A brief summary shows only the first notes.
                         journal.notes.splice(0..0, about_file.next());
