@@ -12,6 +12,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use flate2::{Crc, CrcReader};
 use half::f16;
 use npyz::{DType, Endianness, NpyHeader, Order, TypeChar};
 use zip::ZipArchive;
@@ -20,7 +21,7 @@ use zip::read::ZipFile;
 use super::map::FileMap;
 use super::npy::{HEAD, header_is_sound};
 use super::open::open_file;
-use super::zip_directory::{DeclaredDirectory, declared_directory};
+use super::zip_directory::{DeclaredDirectory, check_checksum, declared_directory};
 use crate::error::{Error, Result};
 
 /// Maximum number of arrays in an `.npz` archive.
@@ -35,6 +36,8 @@ const SCRATCH_PER_BYTE: u64 = 64;
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
 /// Largest possible ratio of decompressed to compressed bytes with DEFLATE.
 const MAX_DEFLATE_FACTOR: u64 = 1032;
+/// Number of bytes of an array whose checksum is computed before their pages are released from memory.
+const CHECKED_BYTES: usize = 1 << 20;
 
 /// Open `.npz` archive.
 #[derive(Debug)]
@@ -61,6 +64,8 @@ pub(crate) struct NpzArray {
     pub(crate) is_compressed: bool,
     /// Size of the array in the archive, in bytes; the compressed size if the array is compressed.
     stored: u64,
+    /// Checksum (CRC-32) that the archive lists for the header and the values of the array.
+    checksum: u32,
     /// Index of the array among the files of the archive.
     index: usize,
     /// Length in bytes of the array's header.
@@ -232,14 +237,15 @@ impl Npz {
     }
 
     /// Returns the values of the array called `name`. If they cannot be read directly from the mapped archive, decodes
-    /// them into an unnamed file in the folder `scratch`.
+    /// them into an unnamed file in the folder `scratch`. Reads all values once, to compare their checksum.
     ///
     /// # Errors
-    /// Fails if the array is missing, holds no floating-point numbers in C order or cannot be decoded, or if the
-    /// scratch file cannot be written.
+    /// Fails if the array is missing, holds no floating-point numbers in C order or cannot be decoded, if its checksum
+    /// is wrong, or if the scratch file cannot be written.
     pub(crate) fn floats(&self, name: &str, scratch: &Path) -> Result<Floats> {
         let (entry, float) = self.float(name)?;
         if entry.is_in_place(float) {
+            self.check_in_place(entry)?;
             return Ok(Floats { map: Arc::clone(&self.map), start: entry.start, len: entry.len() });
         }
         let file = tempfile::tempfile_in(scratch).map_err(Error::io("create a scratch file in", scratch))?;
@@ -264,18 +270,39 @@ impl Npz {
         Ok(Floats { map: Arc::new(map), start: 0, len: entry.len() })
     }
 
+    /// Checks the checksum of the array `entry`, which must be uncompressed and of type f32. Fails if it is wrong.
+    fn check_in_place(&self, entry: &NpzArray) -> Result<()> {
+        self.map.check()?;
+        let mut sum = Crc::new();
+        let end = entry.start + 4 * entry.len();
+        for from in (entry.start - entry.header..end).step_by(CHECKED_BYTES) {
+            let range = from..end.min(from + CHECKED_BYTES);
+            sum.update(&self.map[range.clone()]);
+            self.map.touched(range);
+        }
+        check_checksum(&self.path, &entry.name, [entry.checksum, sum.sum()])
+    }
+
     /// Calls `take` once, with a reader of the values of the array `entry` as bytes, decompressed and without the
     /// header.
     ///
     /// # Errors
-    /// Fails if `take` fails, or if the file was cut short since it was opened.
+    /// Fails if `take` fails, if it reads all values and their checksum is wrong, or if the file was cut short since it
+    /// was opened.
     pub(crate) fn read(&self, entry: &NpzArray, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
         self.map.check()?;
         let mut archive = open_zip(&self.path)?.map_err(|found| self.damaged(entry, &found))?;
-        let mut file = archive.by_index(entry.index).map_err(|error| self.damaged(entry, &error))?;
+        let file = archive.by_index(entry.index).map_err(|error| self.damaged(entry, &error))?;
+        // `CrcReader` counts bytes modulo 2³².
+        let size = file.size() as u32;
+        let mut file = CrcReader::new(file);
         let mut header = vec![0; entry.header];
         file.read_exact(&mut header).map_err(|error| self.damaged(entry, &error))?;
-        take(&mut file)
+        take(&mut file)?;
+        match file.crc().amount() == size {
+            true => check_checksum(&self.path, &entry.name, [entry.checksum, file.crc().sum()]),
+            false => Ok(()),
+        }
     }
 
     /// Builds the error that says that the values of `entry` are damaged.
@@ -332,6 +359,7 @@ impl NpzArray {
             is_fortran: header.order() == Order::Fortran,
             is_compressed,
             stored: file.compressed_size(),
+            checksum: file.crc32(),
             index,
             header: before,
             start: start as usize + before,

@@ -1,7 +1,8 @@
-//! Reads the size of the list of files that a zip archive declares at its end. Readers of archives check it before they
-//! allocate memory for the list.
+//! Reads the size of the list of files that a zip archive declares at its end, and compares checksums of its files.
+//! Readers of archives check the size before they allocate memory for the list.
 
 use std::io::{Error, Read, Result, Seek, SeekFrom};
+use std::path::Path;
 
 /// Length in bytes of the end record (end of central directory) of a zip archive, without the comment that may follow
 /// it.
@@ -62,6 +63,23 @@ pub(crate) fn declared_directory(file: &mut (impl Read + Seek)) -> Result<Declar
     }
     let start = number(&record, 48, 8);
     Ok(DeclaredDirectory { entries: number(&record, 32, 8), bytes: len.saturating_sub(start) })
+}
+
+/// Checks the checksum (CRC-32) of a file called `name` in the zip archive `path`: `found` is that of the bytes that
+/// were read, `listed` the one that the archive lists. A listed checksum of 0 is not compared: some programs, such as
+/// PyTorch, write it if they do not compute one.
+///
+/// # Errors
+/// Fails if the checksums differ, that is, if the bytes are not those that were written.
+pub(crate) fn check_checksum(path: &Path, name: &str, [listed, found]: [u32; 2]) -> crate::error::Result<()> {
+    match listed == 0 || listed == found {
+        true => Ok(()),
+        false => {
+            let (expected, found) = (format!("bytes with the checksum {listed:08x}"), format!("{found:08x}"));
+            Err(crate::error::Error::input(path, name, expected, found)
+                .hint("the file is damaged: copy or download it again"))
+        }
+    }
 }
 
 #[cfg(test)]

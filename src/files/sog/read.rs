@@ -5,6 +5,7 @@ use std::io::{BufReader, Read};
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
+use flate2::Crc;
 use serde_json::Value;
 use zip::ZipArchive;
 
@@ -17,7 +18,7 @@ use crate::error::{Error, Result, quoted};
 use crate::files::json::{ParseAbort, read_from};
 use crate::files::open::{open_file, read_small};
 use crate::files::webp::RgbaImage;
-use crate::files::zip_directory::declared_directory;
+use crate::files::zip_directory::{check_checksum, declared_directory};
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficient_count};
 
@@ -176,6 +177,9 @@ impl Files {
                 let mut bytes = Vec::new();
                 let length = entry.size();
                 entry.by_ref().take(length).read_to_end(&mut bytes).map_err(|error| refused(error.to_string()))?;
+                let mut sum = Crc::new();
+                sum.update(&bytes);
+                check_checksum(path, name, [entry.crc32(), sum.sum()])?;
                 Ok(bytes)
             }
             Files::Folder(folder) => {

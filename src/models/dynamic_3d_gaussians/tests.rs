@@ -87,9 +87,9 @@ fn states_are_the_array_values_compressed_or_not() {
 
 /// Writes the test model to the `.npz` file `path`, with the array `log_scales` as f64. `kind` is the NumPy type of
 /// this array with its byte order, such as `<f8`, and `order` the order of its elements (C or Fortran).
-fn write_with_doubles(path: &Path, kind: &str, order: npyz::Order) {
+fn write_with_doubles(arrays: &Arrays, path: &Path, kind: &str, order: npyz::Order) {
     let mut npz = NpzWriter::new(File::create(path).unwrap());
-    for (name, shape, values) in &arrays() {
+    for (name, shape, values) in arrays {
         let options = FileOptions::default().compression_method(CompressionMethod::Stored);
         if *name == "log_scales" {
             let dtype = npyz::DType::Plain(kind.parse().unwrap());
@@ -112,10 +112,10 @@ fn doubles_of_both_byte_orders_in_an_npz_are_read() {
     write(&path, &arrays(), CompressionMethod::Stored);
     let expected = states(&*open(&path).unwrap());
     for kind in ["<f8", ">f8"] {
-        write_with_doubles(&path, kind, npyz::Order::C);
+        write_with_doubles(&arrays(), &path, kind, npyz::Order::C);
         assert!(states(&*open(&path).unwrap()) == expected, "{kind}");
     }
-    write_with_doubles(&path, "<f8", npyz::Order::Fortran);
+    write_with_doubles(&arrays(), &path, "<f8", npyz::Order::Fortran);
     let message = message(&path);
     assert!(message.contains("log_scales") && message.contains("ascontiguousarray"), "{message}");
 }
@@ -285,4 +285,32 @@ fn archives_restore_model_folders() {
         let kept = CompressedModel::pruned(vec![0, 2, 4], &rule);
         assert_eq!(check_round_trip(&*model, &kept, &OpenOptions::default(), 1e-4), OutputKind::Model);
     }
+}
+
+#[test]
+fn damaged_values_of_an_npz_are_found_by_their_checksum() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("params.npz");
+    // Arrays of more bytes than are read for their headers.
+    let enlarged = |(name, shape, _): (&'static str, Vec<u64>, Vec<f32>)| {
+        let shape: Vec<u64> = shape.into_iter().map(|length| if length == 5 { 6000 } else { length }).collect();
+        let values = (0..shape.iter().product()).map(|i: u64| 0.1 + 0.05 * (i % 17) as f32).collect();
+        (name, shape, values)
+    };
+    let arrays: Arrays = arrays().into_iter().map(enlarged).collect();
+    let assert_found = |name: &str| {
+        let mut bytes = fs::read(&path).unwrap();
+        let at = bytes.windows(name.len()).position(|part| part == name.as_bytes()).unwrap();
+        bytes[at + 20_000] ^= 4;
+        fs::write(&path, &bytes).unwrap();
+        let message = message(&path);
+        let expected = format!("params.npz, {name}: expected bytes with the checksum ");
+        assert!(message.contains(&expected) && message.contains(", found "), "{message}");
+    };
+    for name in ["means3D", "log_scales"] {
+        write(&path, &arrays, CompressionMethod::Stored);
+        assert_found(name);
+    }
+    write_with_doubles(&arrays, &path, "<f8", npyz::Order::C);
+    assert_found("log_scales");
 }
