@@ -288,7 +288,7 @@ fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
             let (id, value) = (at % values.len(), values.planes()[at]);
             return Err(Error::usage(format!(
                 "an archive holds finite values: {} of Gaussian {id} of the result is {value}\n  \
-                 drop it with --drop-ids",
+                 drop it (compress --drop-ids), or write a .ply or .gseq",
                 column.name()
             )));
         }

@@ -148,6 +148,14 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
         None => (RenderSelection::All(format), ViewSet::HeldOut),
     };
     let output = args.output.unwrap_or_default();
+    let named = ImageFormat::from_path(&output).filter(|named| args.format.is_some() && *named != format);
+    if let (RenderSelection::One { .. }, Some(named)) = (selection, named) {
+        let (asked, named, path) = (format.extension(), named.extension(), output.shown());
+        return Err(Error::usage(format!(
+            "{path}: --as {asked} asks for another format than the name of the output, .{named}\n  leave out --as, or \
+             give a name that ends in .{asked}"
+        )));
+    }
     let mut input = input_options(args.input, None, Some(&output), events);
     args.cameras.apply_to(&mut input);
     input.work = cache_request(args.cache_args);
