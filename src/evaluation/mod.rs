@@ -195,10 +195,8 @@ impl ModelPair {
         if let Some(views) = options.max_views {
             chosen = spread_views(chosen, views);
         }
-        let truth = match &options.ground_truth {
-            Some(folder) => Some(Photographs::find(folder, &scene.rig, times, chosen.clone())?.1),
-            None => None,
-        };
+        let find = |folder: &PathBuf| Photographs::find(folder, &scene.rig, times, chosen.clone());
+        let truth = options.ground_truth.as_ref().map(find).transpose()?.map(|found| found.1);
         Ok(ModelPair {
             truth,
             truth_folder: options.ground_truth.clone(),
@@ -342,6 +340,8 @@ impl ModelPair {
             })
         });
         let scene = &self.scene;
+        let loss = Comparison::from_views(&view_qualities, |view| Some(view.loss)).expect("every view has this score");
+        let blind = view_selection::blind_views_note(scene, &self.views, self.background, loss.overall.psnr)?;
         let count = |input: &dyn InputModel| input.source().info().count;
         let path = OriginalAndCompressed {
             original: scene.path.to_string_lossy().into_owned(),
@@ -353,7 +353,9 @@ impl ModelPair {
         let size = OriginalAndCompressed { original: scene.input.size()?, compressed: self.compressed.size()? };
         let larger = size.compressed.why_larger_than(&size.original);
         Ok(Evaluation {
-            notes: tracked.into_iter().filter_map(note).chain(scene.notes.iter().cloned()).chain(larger).collect(),
+            notes: (blind.map(str::to_owned).into_iter().chain(tracked.into_iter().filter_map(note)))
+                .chain(scene.notes.iter().cloned().chain(larger))
+                .collect(),
             tool: TOOL.to_owned(),
             path,
             count: OriginalAndCompressed { original: count(&*scene.input), compressed: count(&*self.compressed) },
@@ -366,7 +368,7 @@ impl ModelPair {
             },
             split: self.split.map_or("all", Split::name).to_owned(),
             background: self.background,
-            loss: Comparison::from_views(&view_qualities, |view| Some(view.loss)).expect("every view has this score"),
+            loss,
             rig_sides: InsideOutsideMeans::from_views(&view_qualities, &self.outside_views()),
             ground_truth,
             render_ms: None,

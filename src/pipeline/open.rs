@@ -71,6 +71,7 @@ pub fn open_to_measure(
         check(None)?;
         if !is_linked(stream.header(), options) {
             let (mut scene, stages, measured) = receive_measured(stream, rig, options, plan, journal)?;
+            warn_of_virtual_views(&mut scene);
             scene.add_outside_views(stages.measure.scan.recipe.outside);
             journal.record_opening("receive", start, scene.source().info().count, ReadCounts::default());
             return Ok((scene, stages, measured));
@@ -83,6 +84,7 @@ pub fn open_to_measure(
         check(Some(frames.times().len()))?;
     }
     let mut scene = from_input(track::run(opened, options, &mut start, journal)?, options)?;
+    warn_of_virtual_views(&mut scene);
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
     scene.add_outside_views(stages.measure.scan.recipe.outside);
     let plan = MemoryPlan::fit_budget(scene.workload(), options.memory, &options.events, |work, limits| {
@@ -94,6 +96,16 @@ pub fn open_to_measure(
     send_forecast(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
     journal.record_opening("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
+}
+
+/// Warns the user, at the start and by a note at the end of the run, if Gaussians are ranked and refined for views of
+/// cameras that do not show the whole scene `scene`, because the program placed them.
+fn warn_of_virtual_views(scene: &mut Scene) {
+    const WARNING: &str = "Gaussians are ranked and refined for virtual views, which costs most of the quality";
+    if !scene.has_cameras {
+        scene.events.send(Message::Warning(WARNING));
+        scene.notes.insert(0, format!("{WARNING}; give the training cameras with --cameras"));
+    }
 }
 
 /// Sends messages with the plan of the run and with the forecast of its time and memory, if the user asked for them. If

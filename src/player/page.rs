@@ -20,7 +20,7 @@ use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::page_policy::{policy_digest, policy_meta_element};
-use crate::model::{Camera, Rig, Split};
+use crate::model::{Camera, Rig};
 use crate::scene::views_outside::{MIN_ANGLE, RigCone, training_cameras};
 
 /// File name of the player page in an output folder.
@@ -122,7 +122,8 @@ pub fn training_rig(rig: &Rig) -> Option<PageRig> {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PageCamera {
     view: u32,
-    split: Split,
+    /// Split of the camera (train, val or test), or "virtual" if the program placed it.
+    split: &'static str,
     /// Time of the camera's only view. `None` if the camera has several views or if its view has no time.
     time: Option<f64>,
     size: [u32; 2],
@@ -136,7 +137,8 @@ pub struct PageCamera {
 
 /// Returns a description, for the page, of each camera that takes a view of `rig`. A camera with several view numbers
 /// gets one entry per view number. Of more than 400 entries, returns an evenly spaced selection of at most 400.
-pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
+/// `is_virtual`: whether the program placed the cameras.
+pub fn cameras(rig: &Rig, is_virtual: bool) -> Vec<PageCamera> {
     let mut places: HashMap<(u32, u32), usize> = HashMap::new();
     let mut found: Vec<(PageCamera, usize)> = Vec::new();
     for rig_view in &rig.views {
@@ -149,7 +151,7 @@ pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
         let camera = &rig.cameras[rig_view.camera as usize];
         let look = PageCamera {
             view: rig_view.view,
-            split: rig_view.split,
+            split: if is_virtual { "virtual" } else { rig_view.split.name() },
             time: rig_view.time,
             size: [camera.width, camera.height],
             focal: [camera.fx, camera.fy],

@@ -149,7 +149,7 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     let mut stage = PageScene {
         tool: TOOL,
         models,
-        cameras: cameras(&scene.rig),
+        cameras: cameras(&scene.rig, scene.has_virtual_rig),
         background,
         center: middle.to_array(),
         extent: if extent > 0.0 { extent } else { 1.0 },

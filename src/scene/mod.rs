@@ -55,6 +55,8 @@ pub struct Scene {
     /// frame. Otherwise the cameras are a virtual rig, which may see only what is in front of it, such as the outside
     /// of a wall.
     pub has_cameras: bool,
+    /// Whether the program placed the cameras, because none were given or found.
+    pub has_virtual_rig: bool,
     /// Background color: red, green, blue in [0, 1]. Taken from the cameras, else from the input's training parameters,
     /// else from the model in whose folder the cameras are, else black.
     pub background: [f32; 3],
@@ -106,6 +108,7 @@ impl Scene {
             schedule,
             outside: 0.0,
             has_cameras: true,
+            has_virtual_rig: false,
             background,
             limits: Limits::NONE,
             planned_reads: None,

@@ -140,7 +140,8 @@ pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> 
     // A stream's number of frames is unknown when its run is planned, so a stream never counts as a scene without
     // motion.
     let is_still = !options.is_stream() && input.source().info().times.len() == 1;
-    let has_cameras = rig.is_some() || is_still;
+    let has_virtual_rig = rig.is_none();
+    let has_cameras = !has_virtual_rig || is_still;
     let rig = match rig {
         Some(rig) => rig,
         None => {
@@ -151,10 +152,7 @@ pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> 
                 true => format!("; the input folder holds cameras: --cameras {folder} uses them"),
                 false => String::new(),
             };
-            notes.push(match is_still {
-                true => format!("no cameras were given or found: {origin}{unused}"),
-                false => format!("{NO_CAMERAS} ({origin}){unused}"),
-            });
+            notes.push(format!("no cameras were given or found: {origin}{unused}"));
             if !is_still {
                 options.events.send(Message::Warning(NO_CAMERAS));
             }
@@ -165,15 +163,15 @@ pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> 
     if scene.schedule.pair_count() == 0 && !scene.source().info().times.is_empty() {
         return Err(no_view_error(&scene.rig));
     }
-    let mut scene =
-        Scene { has_cameras, scratch: options.scratch_folder(), notes, events: options.events.clone(), ..scene };
+    let (scratch, events) = (options.scratch_folder(), options.events.clone());
+    let mut scene = Scene { has_cameras, has_virtual_rig, scratch, notes, events, ..scene };
     scene.open_cache(options)?;
     Ok(scene)
 }
 
-/// Warning about a scene without cameras, shown at the start and at the end of a run.
-const NO_CAMERAS: &str = "no cameras were given or found. Gaussians are ranked and refined for virtual views, which costs \
-                          most of the quality; give the training cameras with --cameras";
+/// Warning about a moving scene without cameras.
+const NO_CAMERAS: &str = "no cameras were given or found. All views are virtual: the program places their cameras \
+                          around the scene; give the training cameras with --cameras";
 
 /// Number of frames at which a model is evaluated if neither its cameras nor the user give one.
 const DEFAULT_FRAMES: usize = 60;

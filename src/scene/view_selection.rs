@@ -1,10 +1,14 @@
 //! Selection of views (frame and camera) to render, of their background, and an estimate of the memory for rendering.
 
+use rayon::prelude::*;
+
 use super::Scene;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
+use crate::metrics::PSNR_CAP_DB;
 use crate::model::{Attributes, FrameView, Rig, Split};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::render;
 
 /// Selection among the views of a camera rig.
@@ -60,6 +64,40 @@ pub(crate) fn distinct_views(rig: &Rig, views: impl Iterator<Item = FrameView>) 
 fn splits_with_views(rig: &Rig) -> Vec<&'static str> {
     let has_views = |split: &Split| rig.views.iter().any(|rig_view| rig_view.split == *split);
     [Split::Train, Split::Val, Split::Test].into_iter().filter(has_views).map(Split::name).collect()
+}
+
+/// Number of views that [`blind_views_note`] renders before it decides whether to render more.
+const CHECKED_VIEWS: usize = 16;
+
+/// Returns a warning for the user if no Gaussian of `scene` is visible in any of the measured `views`, so that renders
+/// of them show only the background color `background`. Renders nothing unless `psnr`, the mean PSNR of the views in
+/// dB, is that of equal images.
+///
+/// # Errors
+/// Fails if a frame cannot be read.
+pub fn blind_views_note(
+    scene: &Scene,
+    views: &[FrameView],
+    background: [f32; 3],
+    psnr: f64,
+) -> Result<Option<&'static str>> {
+    let mut is_blind = psnr >= PSNR_CAP_DB;
+    for views in views.chunks(CHECKED_VIEWS) {
+        if !is_blind {
+            return Ok(None);
+        }
+        let subject = [RenderedSource::all_gaussians(scene.source())];
+        for_each_view_batch(subject, &scene.rig.cameras, views, BatchLimits::one_frame(&scene.limits), |batch| {
+            is_blind &= batch.par_iter().all(|view: &RenderableView<'_, 1>| {
+                view.render(0, background).data.chunks_exact(3).all(|pixel| pixel == background)
+            });
+            Ok(())
+        })?;
+    }
+    Ok(is_blind.then_some(
+        "the measured views show none of the Gaussians, only the background, so their PSNR means nothing; give the \
+         cameras of this scene",
+    ))
 }
 
 /// Returns the error that the chosen split has no views. It names the splits of `rig` that have some.
@@ -261,7 +299,10 @@ mod tests {
         assert_eq!(pairs(&select_views(&same, &[0.0], ViewSet::All).unwrap()), [(0, 3)]);
         let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
         let message = select_views(&two, &[0.0], ViewSet::All).unwrap_err().to_string();
-        assert!(message.contains("view 3 at frame 0") && message.contains("--split train or --split test"), "{message}");
+        assert!(
+            message.contains("view 3 at frame 0") && message.contains("--split train or --split test"),
+            "{message}"
+        );
         let in_one_split = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Train)]);
         let message = select_views(&in_one_split, &[0.0], ViewSet::All).unwrap_err().to_string();
         assert!(message.contains("correct the camera file") && !message.contains("--split"), "{message}");

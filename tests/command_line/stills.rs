@@ -135,3 +135,79 @@ fn frames_of_other_players_are_read_from_a_folder() {
     workplace.refused(1, "info frames", &["--allow-gaps"]);
     assert!(workplace.done("info frames --allow-gaps").contains("SPZ frames"));
 }
+
+#[test]
+fn one_frame_of_a_model_is_the_same_in_a_ply_and_a_glb() {
+    let workplace = Workplace::new();
+    for name in ["frame.ply", "frame.glb"] {
+        let said = workplace.done(&format!("convert {{tiny}} {name} --frames 1"));
+        assert!(said.contains("300 Gaussians x 1 frame, "), "{said}");
+    }
+    assert!(psnr(&workplace, "frame.glb frame.ply") > 99.0);
+    // An archive holds the whole model.
+    workplace.done("convert {tiny} whole.gsz");
+    let parts = ["x.gsz: --frames 1 asks for one frame", "write one frame as .spz"];
+    workplace.refused(2, "convert whole.gsz x.gsz --frames 1", &parts);
+}
+
+#[test]
+fn views_of_a_still_without_cameras_are_virtual() {
+    let workplace = Workplace::new();
+    write_ply(&workplace, "still.ply");
+    let summary = workplace.summary("still.ply -o small.ply --count 20 --no-refine");
+    assert_eq!(summary["quality"]["kind"], "virtual", "{summary}");
+    workplace.done("view still.ply -o page.html");
+    let page = fs::read_to_string(workplace.path("page.html")).unwrap();
+    assert!(page.contains(r#""split":"virtual""#) && !page.contains(r#""split":"train""#));
+    for (input, views) in [("still.ply", "12 virtual views"), ("{tiny}", "12 views of the cameras")] {
+        let archived = workplace.done(&format!("convert {input} x.gsz --overwrite --json"));
+        assert!(archived.contains(&format!("PSNR against renders of the input ({views})")), "{archived}");
+    }
+}
+
+#[test]
+fn only_commands_that_rank_warn_of_ranking_by_virtual_views() {
+    let workplace = Workplace::new();
+    workplace.done("test-scene --gaussians 300 --frames 3 -o demo");
+    for (arguments, ranks) in [
+        ("evaluate demo/scene.gseq demo/scene.gseq", false),
+        ("compress demo/scene.gseq -o out.gseq --ratio 50% --no-refine --prune-only", true),
+    ] {
+        let said = workplace.run(arguments).stderr;
+        assert!(said.contains("warning: no cameras were given or found. All views are virtual"), "{said}");
+        assert_eq!(said.contains("ranked and refined for virtual views"), ranks, "{said}");
+    }
+}
+
+#[test]
+fn views_that_show_no_gaussian_are_not_a_measure_of_quality() {
+    let workplace = Workplace::new();
+    write_ply(&workplace, "still.ply");
+    // Cameras that look along +y: one in front of the Gaussians, one behind them.
+    for (split, y) in [("train", -8.0), ("test", 50.0)] {
+        let pose = serde_json::json!([[1, 0, 0, 5], [0, 0, -1, y], [0, 1, 0, 0.5], [0, 0, 0, 1]]);
+        let frame = serde_json::json!({"file_path": "./r_0", "transform_matrix": pose});
+        let list = serde_json::json!({"camera_angle_x": 1.0, "w": 80, "h": 60, "frames": [frame]});
+        fs::write(workplace.path(&format!("transforms_{split}.json")), list.to_string()).unwrap();
+    }
+    let says = "the measured views show none of the Gaussians";
+    let summary = workplace.summary("still.ply --cameras . -o small.ply --count 20 --no-refine --prune-only");
+    assert!(summary["quality"].is_null() && summary["notes"][0].to_string().contains(says), "{summary}");
+    let evaluated = workplace.done("evaluate still.ply small.ply --cameras .");
+    assert!(evaluated.contains(says), "{evaluated}");
+    assert!(!workplace.done("evaluate still.ply still.ply --cameras . --split train").contains(says));
+}
+
+#[test]
+fn damaged_bytes_of_an_archive_are_found_by_their_checksum() {
+    let workplace = Workplace::new();
+    write_ply(&workplace, "still.ply");
+    workplace.done("convert still.ply still.sog");
+    let mut bytes = fs::read(workplace.path("still.sog")).unwrap();
+    // The bytes of an image follow the name of its file in the archive.
+    let name = b"quats.webp";
+    let at = bytes.windows(name.len()).position(|part| part == name).unwrap() + name.len();
+    bytes[at + 40] ^= 1;
+    fs::write(workplace.path("still.sog"), &bytes).unwrap();
+    workplace.refused(1, "info still.sog", &["still.sog, quats.webp: expected bytes with the checksum ", ", found "]);
+}

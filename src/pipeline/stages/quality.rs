@@ -31,8 +31,9 @@ use crate::outputs::kind::{Fidelity, OutputKind};
 use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
+use crate::progress::Message;
 use crate::pruning::score::scored_memory;
-use crate::scene::view_selection::{self, ViewSet, spread_views};
+use crate::scene::view_selection::{self, ViewSet, blind_views_note, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
 use crate::source::FrameSource;
 
@@ -202,7 +203,8 @@ impl QualityStage {
     ///   run;
     /// - training views, or views of cameras placed by the program.
     ///
-    /// Returns `None` if the result is an archive of frames: its frames exist only once it is written.
+    /// Returns `None` if the result is an archive of frames, whose frames exist only once it is written. Also returns
+    /// `None`, with a warning, if the views show nothing of the scene.
     fn measure(
         &self,
         run: &RunState<'_>,
@@ -217,8 +219,8 @@ impl QualityStage {
             None if written.is_none() && journal.refined.is_some() && journal.photographs.is_none() => {
                 ViewKind::Validation
             }
-            None if scene.has_cameras => ViewKind::Training,
-            None => ViewKind::Virtual,
+            None if scene.has_virtual_rig => ViewKind::Virtual,
+            None => ViewKind::Training,
         };
         let all = view_selection::select_views(&scene.rig, times, ViewSet::HeldOut)?;
         let views = spread_views(all, self.view_count(run));
@@ -249,6 +251,11 @@ impl QualityStage {
             return Ok(Some(QualitySummary { kind, views, psnr, ssim: None, before_conversion, render_ms }));
         }
         let (psnr, ssim) = mean_scores(scene, result, &views)?;
+        if let Some(warning) = blind_views_note(scene, &views, scene.background, psnr)? {
+            scene.events.send(Message::Warning(warning));
+            journal.notes.insert(0, warning.to_owned());
+            return Ok(None);
+        }
         let views = views.len();
         Ok(Some(QualitySummary { kind, views, psnr, ssim: Some(ssim), before_conversion, render_ms }))
     }
