@@ -18,10 +18,11 @@ use crate::limits::ReadLimit;
 use crate::model::Attributes;
 use crate::models::archive::{holds_model_folder, read_archive, restored_output_kind, unpack};
 use crate::models::size::bytes_below;
+use crate::models::{InputModel, TimeOrigin};
 use crate::outputs::kind::{OutputKind, check_folder_name};
 use crate::pipeline::stage::PreparedArchive;
 use crate::pipeline::stages::archive::ArchiveStage;
-use crate::pipeline::stages::reference_views::ArchiveTarget;
+use crate::pipeline::stages::reference_views::{ArchiveTarget, reference_views};
 use crate::pipeline::stages::write::write_within;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_scene};
@@ -109,6 +110,28 @@ pub fn unpack_archive(
     Ok(Some(converted(OutputKind::Model, bytes)))
 }
 
+/// Checks that the user does not ask for one frame (`--frames 1`) of the moving model `model` in an output of the kind
+/// `kind`, which would hold the whole model. `input` holds the options of the user, `output` the path of the output.
+///
+/// # Errors
+/// Returns [`Error::Usage`] with outputs that hold one frame.
+pub fn check_frame_is_asked_of_frames(
+    input: &InputOptions,
+    model: &dyn InputModel,
+    kind: OutputKind,
+    output: &Path,
+) -> Result<()> {
+    let is_one_frame = input.frames == Some(1) && model.timing() == TimeOrigin::Continuous;
+    match is_one_frame && model.keeps_motion(kind) {
+        true => Err(Error::usage(format!(
+            "{}: --frames 1 asks for one frame, but this output holds the whole model with its motion\n  leave out \
+             --frames, or write one frame as .spz, .sog, .glb or --as ply-sequence",
+            output.shown()
+        ))),
+        false => Ok(()),
+    }
+}
+
 /// Writes all Gaussians of `input` to the archive `output`. The quantization steps are chosen so that renders of the
 /// archive have about 50 dB PSNR against renders of the input. If the input stores every frame explicitly, the archive
 /// is a container with an error bound for each attribute; the bounds are chosen for the same PSNR. Returns the report
@@ -125,6 +148,7 @@ pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) ->
     }
     check_target(output, TargetKind::File, &[&input.path], overwrite)?;
     let mut scene = open_scene(input)?;
+    check_frame_is_asked_of_frames(input, &*scene.input, OutputKind::Archive, output)?;
     scene.input.check_output(OutputKind::Archive, output)?;
     let stage = ArchiveStage { psnr: None, refine: None };
     scene.plan_memory(input.memory, |work, limits| vec![stage.resource_estimate(work, limits)])?;
@@ -144,7 +168,11 @@ pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) ->
     }
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
-    journal.notes.push(format!("archive: {:.2} dB PSNR against renders of the input", summary.psnr));
+    let views = reference_views(&scene).len();
+    let of_cameras = if scene.has_virtual_rig { "virtual views" } else { "views of the cameras" };
+    journal
+        .notes
+        .push(format!("archive: {:.2} dB PSNR against renders of the input ({views} {of_cameras})", summary.psnr));
     Ok(ConvertReport {
         path: output.to_owned(),
         kind: OutputKind::Archive,

@@ -68,6 +68,11 @@ pub(crate) fn view_count(pixels: u64) -> u64 {
     (MAX_VIEW_BYTES / (2 * BYTES_PER_PIXEL * pixels.max(1))).clamp(fewest, most)
 }
 
+/// Returns the views of `scene` on which an archive is compared with the result before quantization.
+pub(crate) fn reference_views(scene: &Scene) -> Vec<FrameView> {
+    select_evenly(&scene.schedule, view_count(scene.workload().pixels) as usize, 1)
+}
+
 /// Requirement on an archive that follows from the goal of the run. The PSNR of the option `--archive-psnr` is passed
 /// separately.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -151,9 +156,7 @@ pub(crate) struct ReferenceViews<'a> {
 
 impl ReferenceViews<'_> {
     pub(crate) fn new<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<ReferenceViews<'a>> {
-        let count = view_count(scene.workload().pixels) as usize;
-        let mut reference_views =
-            ReferenceViews { scene, views: select_evenly(&scene.schedule, count, 1), images: Vec::new() };
+        let mut reference_views = ReferenceViews { scene, views: reference_views(scene), images: Vec::new() };
         reference_views.images = reference_views.render(source, |_, image| image)?;
         Ok(reference_views)
     }
@@ -207,7 +210,7 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
         return Err(Error::usage(
             "the quantization of an archive is chosen by renders: expected numbers in every pixel, found NaN in \
              some\n  \
-             --set non_finite=drop removes the Gaussians that are not finite; a .gseq holds them as they are",
+             compress --set non_finite=drop removes the Gaussians that are not finite; a .gseq holds them as they are",
         ));
     }
     Ok(psnr)
