@@ -7,7 +7,7 @@ use bytesize::ByteSize;
 
 use super::summary::{Summary, SummaryDetail};
 use crate::error::ShowPath;
-use crate::journal::records::{PhotographSummary, QualitySummary, ViewKind};
+use crate::journal::records::{PhotographSummary, QualitySummary, ShDegreeSummary, ViewKind};
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::models::ModelSize;
 use crate::outputs::kind::OutputKind;
@@ -222,7 +222,10 @@ impl Summary {
             false => writeln!(out, "\nSee it:   splatsieve view {original} {result}{cameras} -o {page}")?,
         }
         if kind == OutputKind::Model && self.output_size.field > 0 {
-            writeln!(out, "Smaller:  -o {} writes an archive, which unpacks to the same folder", beside(".gsz"))?;
+            // The archive would have all SH degrees, because only its quantization removes colors.
+            let has_dropped = |bands: &ShDegreeSummary| bands.tried.iter().any(|(degree, _)| *degree >= bands.sh_degree);
+            let folder = if self.bands.as_ref().is_some_and(has_dropped) { "a model" } else { "the same" };
+            writeln!(out, "Smaller:  -o {} writes an archive, which unpacks to {folder} folder", beside(".gsz"))?;
         }
         Ok(())
     }

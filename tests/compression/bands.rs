@@ -41,6 +41,17 @@ fn write_faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
 const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --set field=exact --overwrite";
 
 #[test]
+fn archives_unpack_to_the_same_folder_only_without_dropped_degrees() {
+    let workplace = Workplace::new();
+    write_faint_above(&workplace, 1);
+    for (bands, says) in [("needed", "unpacks to a model folder"), ("all", "unpacks to the same folder")] {
+        let said = workplace
+            .done(&format!("compress {QUICKLY} --ratio 0.5 --set bands={bands} --set bands_margin=90 -o small"));
+        assert!(said.contains(says), "{bands}: {said}");
+    }
+}
+
+#[test]
 fn invisible_sh_coefficients_and_their_degree_go() {
     for degree in [0, 1, 2] {
         let workplace = Workplace::new();
