@@ -176,6 +176,11 @@ impl Progress {
     }
 }
 
+/// Formats a count with its noun: "1 view" or "60 views".
+pub fn counted(count: usize, noun: &str) -> String {
+    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
+}
+
 /// Formats a duration in seconds for display: "59.4 s", "1 min 00 s", "2 h 01 min".
 pub fn format_duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;

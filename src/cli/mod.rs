@@ -12,9 +12,11 @@ mod run;
 mod signals;
 
 use std::ffi::OsString;
+use std::num::{ParseFloatError, ParseIntError};
 use std::process::ExitCode;
 
 use clap::FromArgMatches;
+use clap::error::ContextKind;
 
 use args::Cli;
 use message::show;
@@ -57,7 +59,22 @@ pub(crate) fn main() -> ExitCode {
 
 /// Parses the words of a command line. The first word is the name of the program.
 fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<Cli, clap::Error> {
-    help::command().try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found))
+    let parsed = help::command().try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found));
+    parsed.map_err(with_plain_type)
+}
+
+/// Returns `error`, in which an error of Rust about a text that is no number says in plain words what was expected.
+fn with_plain_type(error: clap::Error) -> clap::Error {
+    let source = std::error::Error::source(&error);
+    let expected = match source {
+        Some(source) if source.is::<ParseIntError>() => "a whole number",
+        Some(source) if source.is::<ParseFloatError>() => "a number",
+        _ => return error,
+    };
+    let [value, option] = [ContextKind::InvalidValue, ContextKind::InvalidArg]
+        .map(|kind| error.get(kind).map_or(String::new(), ToString::to_string));
+    let more = "For more information, try '--help'.";
+    clap::Error::raw(error.kind(), format!("invalid value '{value}' for '{option}': expected {expected}\n\n{more}\n"))
 }
 
 /// Prints the error that ended a run and returns its exit code. Returns success without a message if the run ended

@@ -307,7 +307,9 @@ impl Log {
         if let Some(total) = self.total.filter(|&total| total != done) {
             let _ = write!(line, " of {}", HumanCount(total));
         }
-        let _ = write!(line, " {}, {}, ", self.unit, rate(per_second, &self.unit));
+        let is_single = done == 1 && self.total.is_none_or(|total| total == 1);
+        let unit = if is_single { self.unit.strip_suffix('s').unwrap_or(&self.unit) } else { &self.unit };
+        let _ = write!(line, " {unit}, {}, ", rate(per_second, &self.unit));
         let _ = match self.total.filter(|&total| total > done && !ended) {
             Some(total) => write!(line, "{} left", format_duration((total - done) as f64 / per_second)),
             None => write!(line, "{}", format_duration(elapsed.as_secs_f64())),
@@ -373,6 +375,9 @@ mod tests {
         assert_eq!(scan.line(minute, false), "scan  626,490 of 1,252,980 states, 10 k states/s, 1 min 00 s left");
         assert_eq!(scan.line(minute, true), "scan  626,490 of 1,252,980 states, 10 k states/s, 1 min 00 s");
         scan.advanced(626_490);
+        let single = log("emit", "frames", Some(1));
+        single.done.store(1, Ordering::Relaxed);
+        assert_eq!(single.line(Duration::from_secs(1), true), "emit  1 frame, 1 frames/s, 1.0 s");
         assert_eq!(scan.line(Duration::from_millis(404), true), "scan  1,252,980 states, 3.1 M states/s, 0.4 s");
         let counter = log("receive", "frames", None);
         counter.advanced(72);

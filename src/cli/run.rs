@@ -26,7 +26,7 @@ use splatsieve::pipeline::summary::SummaryDetail;
 use splatsieve::pipeline::{self, compress, shardable_stages};
 use splatsieve::player::view;
 use splatsieve::player::view::{ViewOptions, ViewReport};
-use splatsieve::progress::Events;
+use splatsieve::progress::{Events, counted};
 use splatsieve::recipe::preset_text;
 use splatsieve::report::{self, ReportOptions, trade_off};
 
@@ -222,7 +222,7 @@ fn write_page(options: &ViewOptions) -> Result<String> {
 /// Returns a line of text with the path of a page of the player, its number of frames and its size.
 fn page_text(report: &ViewReport) -> String {
     let files = if report.files == 1 { String::new() } else { format!(" in {} files", report.files) };
-    format!("{}: {} frames, {} bytes{files}", report.page.shown(), report.frames, report.bytes)
+    format!("{}: {}, {} bytes{files}", report.page.shown(), counted(report.frames, "frame"), report.bytes)
 }
 
 /// Runs the command `convert`: writes an input in another format and prints a description of the output. A frame stream

@@ -32,6 +32,7 @@ use crate::outputs::kind::{OutputKind, check_container_name};
 use crate::passes::FrameReaders;
 use crate::pipeline::stages::write::ENCODE_SECONDS_PER_STATE;
 use crate::pipeline::summary::InputSummary;
+use crate::progress::counted;
 use crate::scene::{
     InputOptions, OpenedInput, first_frame_box, frame_quota, is_linked, no_frames_error, open_cache, open_input,
     open_stream, receive_untracked,
@@ -331,13 +332,15 @@ impl InputInfo {
     pub fn text(&self) -> String {
         let input = &self.input;
         let mut out = format!(
-            "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes: {}, digest {}\n",
+            "{}: {}\n  {}, SH degree {}, {}\n  varying: {}\n  {} bytes{}, digest {}\n",
             Path::new(&input.path).shown(),
             input.kind,
-            input.gaussians,
+            counted(input.gaussians, "Gaussian"),
             input.sh_degree,
             match self.times {
-                Some((first, last)) => format!("{} frames from t = {first} to {last}", input.frames.unwrap_or(0)),
+                Some((first, last)) => {
+                    format!("{} from t = {first} to {last}", counted(input.frames.unwrap_or(0), "frame"))
+                }
                 None => match input.frames {
                     Some(_) => "no frames".to_owned(),
                     None => "continuous in time".to_owned(),
@@ -345,7 +348,7 @@ impl InputInfo {
             },
             if input.varying.is_empty() { "nothing".to_owned() } else { input.varying.join(", ") },
             input.bytes,
-            input.size.parts_text(),
+            if input.bytes == 0 { String::new() } else { format!(": {}", input.size.parts_text()) },
             input.digest,
         );
         for column in &self.columns {

@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::error::ShowPath;
 use crate::outputs::kind::OutputKind;
+use crate::progress::counted;
 
 /// Result of the command `convert`.
 #[derive(Debug, Serialize)]
@@ -31,8 +32,9 @@ impl ConvertReport {
     /// Returns the result as a line of text for the terminal: path, numbers of Gaussians and frames, bytes. If the
     /// output is larger than the input, adds a second line with the reason.
     pub fn text(&self) -> String {
-        let frames = self.frames.map_or(String::new(), |frames| format!(" x {frames} frames"));
+        let frames = self.frames.map_or(String::new(), |frames| format!(" x {}", counted(frames, "frame")));
         let larger = self.larger.as_ref().map_or(String::new(), |why| format!("  {why}\n"));
-        format!("{}: {} Gaussians{frames}, {} bytes\n{larger}", self.path.shown(), self.gaussians, self.bytes)
+        let gaussians = counted(self.gaussians, "Gaussian");
+        format!("{}: {gaussians}{frames}, {} bytes\n{larger}", self.path.shown(), self.bytes)
     }
 }

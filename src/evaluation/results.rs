@@ -17,6 +17,7 @@ use crate::journal::records::RenderTime;
 use crate::models::ModelSize;
 use crate::models::size::format_ratio;
 use crate::pipeline::summary::CameraSummary;
+use crate::progress::counted;
 
 /// Pair of values: one for the original model and one for the compressed model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -300,12 +301,13 @@ impl Evaluation {
         );
         let frames = self.loss.per_frame.len();
         let kind = match self.split.as_str() {
-            "train" => "training views",
-            "val" => "validation views",
-            "test" => "test views",
-            _ => "views",
+            "train" => "training view",
+            "val" => "validation view",
+            "test" => "test view",
+            _ => "view",
         };
-        let _ = writeln!(out, "{} {kind} of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
+        let views = counted(self.cameras.pairs, kind);
+        let _ = writeln!(out, "{views} of {}: {}", counted(frames, "frame"), self.cameras.origin);
         let with_flip = self.loss.overall.flip.is_some();
         let flip = if with_flip { "     FLIP" } else { "" };
         let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}{flip}", "", "PSNR dB", "SSIM", "temporal");

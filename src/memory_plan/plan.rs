@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::VIEWS_PER_THREAD;
-use crate::progress::{Events, Message, format_duration};
+use crate::progress::{Events, Message, counted, format_duration};
 
 /// Decoded tiles of a container may take at most the memory budget divided by this number. A tile holds the values of
 /// consecutive Gaussians at consecutive frames.
@@ -177,7 +177,11 @@ impl MemoryPlan {
              raise --memory to that or lower --threads; --explain lists the memory of every stage",
             format_bytes(self.budget),
             self.work.gaussians,
-            if self.work.frames > 0 { format!(" x {} frames", self.work.frames) } else { String::new() }
+            if self.work.frames > 0 {
+                format!(" x {}", counted(self.work.frames as usize, "frame"))
+            } else {
+                String::new()
+            }
         ))
     }
 
@@ -189,13 +193,13 @@ impl MemoryPlan {
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "memory: at most {} of {} for {} Gaussians x {} frames, {} views, {} threads",
+            "memory: at most {} of {} for {} Gaussians x {}, {}, {}",
             format_bytes(self.peak_bytes()),
             format_bytes(self.budget),
             work.gaussians,
-            work.frames,
-            work.frame_views,
-            work.threads
+            counted(work.frames as usize, "frame"),
+            counted(work.frame_views as usize, "view"),
+            counted(work.threads as usize, "thread")
         );
         let _ = writeln!(
             out,

@@ -20,6 +20,7 @@ use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::stages::write::companion_names;
 use crate::pipeline::throughput::forecast;
+use crate::progress::counted;
 use crate::scene::{InputOptions, open_scene};
 
 /// Report of a dry run, which tells what a run would do without doing it.
@@ -143,15 +144,16 @@ impl DryRunReport {
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "{}: {}, {} Gaussians x {} frames, SH degree {}",
+            "{}: {}, {} x {}, SH degree {}",
             Path::new(&self.path).shown(),
             self.kind,
-            self.gaussians_in,
-            self.frames,
+            counted(self.gaussians_in, "Gaussian"),
+            counted(self.frames, "frame"),
             self.sh_degree
         );
         let CameraSummary { origin, cameras, pairs } = &self.cameras;
-        let _ = writeln!(out, "cameras: {origin} ({cameras} cameras, {pairs} views)");
+        let (cameras, views) = (counted(*cameras, "camera"), counted(*pairs, "view"));
+        let _ = writeln!(out, "cameras: {origin} ({cameras}, {views})");
         let _ = match self.gaussians {
             Some(count) => {
                 let percent = 100.0 * count as f64 / self.gaussians_in.max(1) as f64;

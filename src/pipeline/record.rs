@@ -15,6 +15,7 @@ use crate::model::{Split, format_ranges};
 use crate::models::{LinkMode, ZeroRotation};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
+use crate::recipe::plain_toml_error;
 
 /// Program and input with which a recipe file was written.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -117,6 +118,10 @@ pub struct RecipeRecord {
     pub run: Option<RunOptions>,
 }
 
+/// Error message for a recipe with several targets.
+const ONE_TARGET: &str =
+    "expected one of target_count, target_ratio, min_psnr, max_loss with ground_truth, and target_size";
+
 impl RunOptions {
     /// Returns the requested number or fraction of Gaussians, if any.
     pub fn target(&self) -> Option<Target> {
@@ -127,7 +132,7 @@ impl RunOptions {
     ///
     /// # Errors
     /// Fails with a message for the user in these cases:
-    /// - there are several goals, or both a goal and a target number of Gaussians;
+    /// - there are several goals, both a goal and a target number of Gaussians, or this number in two forms;
     /// - `max_loss` or `toward = "photographs"` is given without `ground_truth` (folder of photographs), or
     ///   `ground_truth` without both;
     /// - a value in decibels is out of range.
@@ -139,6 +144,9 @@ impl RunOptions {
                 .to_owned());
         }
         let photographs = self.ground_truth.as_ref().filter(|_| self.max_loss.is_some());
+        if self.target_count.is_some() && self.target_ratio.is_some() {
+            return Err(ONE_TARGET.to_owned());
+        }
         match (self.target(), self.min_psnr, self.max_loss, photographs, self.target_size) {
             (_, None, None, None, None) => Ok(None),
             (None, Some(least), None, None, None) => {
@@ -149,10 +157,7 @@ impl RunOptions {
                 Ok(Some(Goal::Quality(Quality::Loss { most, photographs: photographs.clone() })))
             }
             (None, None, None, None, Some(most)) => Ok(Some(Goal::Bytes(most))),
-            _ => {
-                Err("expected one of target_count, target_ratio, min_psnr, max_loss with ground_truth, and target_size"
-                    .to_owned())
-            }
+            _ => Err(ONE_TARGET.to_owned()),
         }
     }
 }
@@ -224,7 +229,7 @@ impl RecipeRecord {
     /// # Errors
     /// Fails with a message if one of the two tables has unknown or wrong entries.
     pub fn read(text: &str, folder: &Path) -> std::result::Result<RecipeRecord, String> {
-        let record: RecipeRecord = toml::from_str(text).map_err(|error| error.to_string())?;
+        let record: RecipeRecord = toml::from_str(text).map_err(|error| plain_toml_error(&error))?;
         Ok(RecipeRecord { run: record.run.map(|run| run.with_paths(|path| folder.join(path))), ..record })
     }
 
@@ -253,6 +258,23 @@ mod tests {
     use crate::pipeline::ids::parse_ids;
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
+
+    #[test]
+    fn a_number_of_gaussians_in_two_forms_is_refused() {
+        let run = RunOptions { target_count: Some(10), target_ratio: Some(0.5), ..RunOptions::default() };
+        assert!(run.goal().unwrap_err().contains("one of target_count, target_ratio"));
+        assert_eq!(RunOptions { target_count: None, ..run }.goal().unwrap(), None);
+    }
+
+    #[test]
+    fn wrong_types_are_named_in_plain_words() {
+        for (text, expected) in
+            [("frames = \"many\"", "expected a whole number, 0 or more"), ("min_psnr = true", "expected a number")]
+        {
+            let message = RecipeRecord::read(&format!("[run]\n{text}\n"), Path::new(".")).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+    }
 
     #[test]
     fn record_reads_back_unchanged_beside_the_recipe() {

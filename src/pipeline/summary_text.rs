@@ -11,7 +11,7 @@ use crate::journal::records::{PhotographSummary, QualitySummary, ShDegreeSummary
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::models::ModelSize;
 use crate::outputs::kind::OutputKind;
-use crate::progress::format_duration;
+use crate::progress::{counted, format_duration};
 use crate::refinement::photographs::FIT;
 
 /// Maximum number of notes that the text of a summary shows unless all details are requested.
@@ -42,17 +42,19 @@ impl Summary {
         let input = &self.input;
         writeln!(
             out,
-            "{}: {}, {} Gaussians x {} frames, SH degree {}",
+            "{}: {}, {} x {}, SH degree {}",
             Path::new(&input.path).shown(),
             input.kind,
-            input.gaussians,
-            input.frames.unwrap_or(0),
+            counted(input.gaussians, "Gaussian"),
+            counted(input.frames.unwrap_or(0), "frame"),
             input.sh_degree
         )?;
         writeln!(
             out,
-            "cameras: {} ({} cameras, {} views)",
-            self.cameras.origin, self.cameras.cameras, self.cameras.pairs
+            "cameras: {} ({}, {})",
+            self.cameras.origin,
+            counted(self.cameras.cameras, "camera"),
+            counted(self.cameras.pairs, "view")
         )?;
         for stage in &self.stages {
             let scratch = match stage.scratch_bytes {
@@ -223,7 +225,8 @@ impl Summary {
         }
         if kind == OutputKind::Model && self.output_size.field > 0 {
             // The archive would have all SH degrees, because only its quantization removes colors.
-            let has_dropped = |bands: &ShDegreeSummary| bands.tried.iter().any(|(degree, _)| *degree >= bands.sh_degree);
+            let has_dropped =
+                |bands: &ShDegreeSummary| bands.tried.iter().any(|(degree, _)| *degree >= bands.sh_degree);
             let folder = if self.bands.as_ref().is_some_and(has_dropped) { "a model" } else { "the same" };
             writeln!(out, "Smaller:  -o {} writes an archive, which unpacks to {folder} folder", beside(".gsz"))?;
         }
@@ -278,11 +281,6 @@ fn grouped(number: u64) -> String {
     let groups: Vec<&str> =
         digits.as_bytes().rchunks(3).rev().filter_map(|group| std::str::from_utf8(group).ok()).collect();
     groups.join(",")
-}
-
-/// Formats a count with its noun: "1 view" or "60 views".
-fn counted(count: usize, noun: &str) -> String {
-    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use crate::journal::records::{EstimateRange, Forecast, StageForecast};
 use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, format_bytes};
-use crate::progress::format_duration;
+use crate::progress::{counted, format_duration};
 
 /// Lowest and highest ratio of measured to estimated core-seconds of runs after a calibration, found on three trained
 /// models at several sizes (`scripts/estimate.py`) and slightly widened.
@@ -69,13 +69,14 @@ impl Forecast {
     /// [`Verbosity::Plan`] also the core-seconds of every stage.
     pub fn text(&self, tell: Verbosity) -> String {
         let Forecast { seconds, core_seconds: core, threads, stages, .. } = self;
+        let threads = counted(*threads as usize, "thread");
         let mut out = String::new();
         // Writing to a String cannot fail.
         let _ = match seconds.most {
-            ..2.0 => writeln!(out, "time: a second or two on {threads} threads"),
+            ..2.0 => writeln!(out, "time: a second or two on {threads}"),
             _ => writeln!(
                 out,
-                "time: about {}, {} to {} on {threads} threads; {} to {} core-seconds",
+                "time: about {}, {} to {} on {threads}; {} to {} core-seconds",
                 approximate_time(seconds.likely),
                 approximate_time(seconds.least),
                 approximate_time(seconds.most),

@@ -75,8 +75,7 @@ impl Recipe {
     /// parameter is unknown or out of range.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
         let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
-        let recipe: Recipe =
-            over_preset(over, Some(fallback))?.try_into().map_err(|e: toml::de::Error| e.to_string())?;
+        let recipe: Recipe = over_preset(over, Some(fallback))?.try_into().map_err(|error| plain_toml_error(&error))?;
         recipe.validate()?;
         Ok(recipe)
     }
@@ -85,19 +84,20 @@ impl Recipe {
     /// `false`, or a name without quotes. Fails with a message if there is no such parameter, or if `value` is not of
     /// its type.
     pub fn with_parameter(&self, section: &str, key: &str, value: &str) -> std::result::Result<Recipe, String> {
-        let number = value.parse::<f64>().map(toml::Value::Float);
-        let whole = value.parse::<i64>().map(toml::Value::Integer);
-        let truth = value.parse::<bool>().map(toml::Value::Boolean);
+        let number = value.parse().map(toml::Value::Float).ok().ok_or("a number");
+        let whole = value.parse().map(toml::Value::Integer).ok().ok_or("a whole number");
+        let truth = value.parse().map(toml::Value::Boolean).ok().ok_or("true or false");
+        let wrong = |expected: &str| format!("expected {expected}, found {}", quoted(value));
         let mut table = toml::Table::try_from(self).map_err(|e| e.to_string())?;
         let slot =
             table.get_mut(section).and_then(|t| t.get_mut(key)).ok_or(format!("no parameter {section}.{key}"))?;
         *slot = match slot {
-            toml::Value::Integer(_) => whole.map_err(|e| e.to_string())?,
-            toml::Value::Float(_) => number.map_err(|e| e.to_string())?,
-            toml::Value::Boolean(_) => truth.map_err(|e| e.to_string())?,
+            toml::Value::Integer(_) => whole.map_err(wrong)?,
+            toml::Value::Float(_) => number.map_err(wrong)?,
+            toml::Value::Boolean(_) => truth.map_err(wrong)?,
             _ => toml::Value::String(value.to_owned()),
         };
-        table.try_into().map_err(|e: toml::de::Error| e.to_string())
+        table.try_into().map_err(|error| plain_toml_error(&error))
     }
 
     /// Returns this recipe with refinement turned off.
@@ -210,6 +210,27 @@ impl Recipe {
             None => Ok(()),
         }
     }
+}
+
+/// Returns the message of `error` for users, with the expected type of a value in plain words instead of the name of a
+/// Rust type.
+pub(crate) fn plain_toml_error(error: &toml::de::Error) -> String {
+    const TYPES: [(&str, &str); 8] = [
+        ("a nonzero u32", "a whole number of at least 1"),
+        ("a nonzero usize", "a whole number of at least 1"),
+        ("f64", "a number"),
+        ("u32", "a whole number, 0 or more"),
+        ("u64", "a whole number, 0 or more"),
+        ("usize", "a whole number, 0 or more"),
+        ("a boolean", "true or false"),
+        ("a string", "a text in quotes"),
+    ];
+    let message = error.to_string();
+    let replaced = TYPES.iter().find_map(|(name, plain)| {
+        let (before, after) = message.split_once(&format!("expected {name}"))?;
+        (!after.starts_with(|c: char| c.is_alphanumeric())).then(|| format!("{before}expected {plain}{after}"))
+    });
+    replaced.unwrap_or(message)
 }
 
 /// Returns the TOML text of the preset `name`. Fails if there is no preset of that name.

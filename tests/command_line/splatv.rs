@@ -227,10 +227,14 @@ fn times_outside_0_to_1_are_scaled_for_comparison() {
 
     let options = "--cameras cameras.json --prune-only --no-refine --ratio 1";
     let summary = workplace.summary(&format!("scene.gseq -o curves.splatv {options}"));
-    let [said, measured] = [&summary, &json(&workplace, "evaluate scene.gseq curves.splatv --cameras cameras.json --json")]
-        .map(|found| found["quality"]["psnr"].as_f64().or(found["psnr"].as_f64()).unwrap());
+    let [said, measured] =
+        [&summary, &json(&workplace, "evaluate scene.gseq curves.splatv --cameras cameras.json --json")]
+            .map(|found| found["quality"]["psnr"].as_f64().or(found["psnr"].as_f64()).unwrap());
     assert!(summary["quality"]["before_conversion"].is_null(), "{summary}");
     assert!((said - measured).abs() < 2.0 && measured > 30.0, "{said} dB printed, {measured} dB measured");
     let evaluated = workplace.done("evaluate scene.gseq curves.splatv --cameras cameras.json");
-    assert!(evaluated.contains("the times of the original, -2 to 6, are compared with the times 0 to 1"), "{evaluated}");
+    assert!(
+        evaluated.contains("the times of the original, -2 to 6, are compared with the times 0 to 1"),
+        "{evaluated}"
+    );
 }

@@ -78,16 +78,21 @@ impl StreamHeader {
         bytes
     }
 
-    /// Decodes a header from its stored bytes.
+    /// Decodes a header from its stored bytes, of which the first `received` have been received.
     ///
     /// # Errors
     /// Returns the first field that violates format/STREAM.md.
-    pub(crate) fn from_bytes(bytes: &[u8; Self::BYTES]) -> Result<Self, IllegalField> {
+    pub(crate) fn from_bytes(bytes: &[u8; Self::BYTES], received: usize) -> Result<Self, IllegalField> {
         let illegal = |offset, expected: &str, found: String, hint| {
             Err(IllegalField { offset, expected: expected.to_owned(), found, hint })
         };
         if bytes[..8] != Self::MAGIC {
-            return illegal(0, "a frame stream (format/STREAM.md)", quoted(&escaped(&bytes[..8])), FOREIGN_OUTPUT);
+            return illegal(
+                0,
+                "a frame stream (format/STREAM.md)",
+                quoted(&escaped(&bytes[..received.min(8)])),
+                FOREIGN_OUTPUT,
+            );
         }
         let version = u32_at(bytes, 8);
         if !VERSIONS.contains(&version) {

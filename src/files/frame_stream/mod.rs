@@ -63,7 +63,7 @@ impl<R: Read> FrameStream<R> {
         if got < header.len() && (got == 0 || header[..got.min(8)] == StreamHeader::MAGIC[..got.min(8)]) {
             return Err(bytes.ended("the header of a frame stream", None));
         }
-        let header = StreamHeader::from_bytes(&header).map_err(|illegal| bytes.error(0, None, illegal))?;
+        let header = StreamHeader::from_bytes(&header, got).map_err(|illegal| bytes.error(0, None, illegal))?;
         let mut constant = Gaussians::zeros(0, header.sh_degree);
         let columns = Attributes::all().difference(header.varying);
         let announced = 4 * columns.width(header.sh_degree) as u64 * header.count as u64;

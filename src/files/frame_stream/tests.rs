@@ -189,6 +189,9 @@ fn swapped_lost_or_repeated_frames_are_refused() {
 
 #[test]
 fn text_printed_into_the_stream_is_refused() {
+    // A text shorter than the name of the format is quoted as it came.
+    let message = refusal(b"hello\n");
+    assert!(message.contains(r#"found "hello\n""#) && !message.contains(r"\x00"), "{message}");
     let (_, bytes, starts) = written();
     let mut within = bytes.clone();
     within.splice(starts[1] + 100..starts[1] + 100, *b"epoch 7\n");
