@@ -40,7 +40,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
         static_score: &scores.static_score,
         dynamic_score: &scores.dynamic_score,
         score: &scores.score,
-        keep: &scored.selection.keep,
+        keep: &scored.selection.keep(),
     };
     let staged = StagedFile::new(output, overwrite)?;
     match extension.as_str() {

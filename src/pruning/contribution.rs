@@ -128,7 +128,7 @@ mod tests {
     use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::{AnomalyFlags, Gaussians, Rig, SequenceInfo, Split, StatisticRows, ViewSchedule};
     use crate::passes::scoring_views;
-    use crate::pruning::{Overrides, select};
+    use crate::pruning::select;
     use crate::recipe::{self, Recipe};
     use crate::render;
     use crate::source::BlockReader;
@@ -299,7 +299,7 @@ mod tests {
             flags: vec![AnomalyFlags::empty(); count],
         };
         let scores = score::score(&rows, 2, &recipe.score);
-        let selection = select(&scores, &recipe.select, &Overrides::default()).unwrap();
+        let selection = select(&scores, &recipe.select, &[], &[]).unwrap();
         let unseen: Vec<bool> = selection.ranking.order().iter().map(|&id| rows.c[id as usize] == 0.0).collect();
         assert!(unseen.is_sorted() && unseen.iter().filter(|&&unseen| unseen).count() < 5, "{unseen:?}");
     }

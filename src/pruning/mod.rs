@@ -1,6 +1,6 @@
 //! Selection of the Gaussians that stay, by their scores ("sampling and pruning" in method.md, section 4).
 //!
-//! Input: scores. Output: for every Gaussian whether it stays, and a ranking of all Gaussians in which those that stay
+//! Input: scores. Output: the number of Gaussians that stay, and a ranking of all Gaussians in which those that stay
 //! come first, so that any other number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and
 //! [`WORKING_BYTES_PER_GAUSSIAN`] while selecting. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting
 //! Models", section 3.3.
@@ -12,6 +12,7 @@ pub mod score;
 pub mod visibility;
 
 pub use ranking::Ranking;
+use ranking::Ranks;
 
 use serde::{Deserialize, Serialize};
 
@@ -19,26 +20,24 @@ use crate::error::{Error, Result};
 use crate::recipe::{LowScorePolicy, SelectParams};
 use crate::statistics::score::Scores;
 
-/// Ids, in any order, of Gaussians that are kept or dropped because the user says so, whatever their scores.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Overrides {
-    /// Ids of Gaussians that are always kept.
-    pub keep_ids: Vec<u32>,
-    /// Ids of Gaussians that are always dropped.
-    pub drop_ids: Vec<u32>,
-}
-
 /// Result of the selection, which has two stages: stage 1 takes the best fraction of the Gaussians by score, stage 2
 /// applies thresholds to the static and the dynamic score.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Selection {
-    /// For each Gaussian, whether it is kept.
-    pub keep: Vec<bool>,
     /// Ranking of the Gaussians that the user does not drop, best first. Its first `counts.kept` Gaussians are those
     /// that stay.
     pub ranking: Ranking,
     /// Numbers of Gaussians that each stage of the selection keeps and prunes.
     pub counts: SelectionCounts,
+}
+
+impl Selection {
+    /// Returns for each Gaussian whether it is kept.
+    pub fn keep(&self) -> Vec<bool> {
+        let mut keep = vec![false; self.counts.total];
+        self.ranking.order()[..self.counts.kept].iter().for_each(|&id| keep[id as usize] = true);
+        keep
+    }
 }
 
 /// Numbers of Gaussians at each stage of the selection. `total` = `candidates` + `rescued` + `pruned_by_stage_1`, and
@@ -64,13 +63,14 @@ pub struct SelectionCounts {
 }
 
 /// Bytes of memory per Gaussian for the result of a selection and a copy of its ranking.
-pub const BYTES_PER_GAUSSIAN: usize = size_of::<bool>() + 2 * size_of::<u32>();
+pub const BYTES_PER_GAUSSIAN: usize = 2 * size_of::<u32>();
 /// Bytes of memory per Gaussian that are needed only while selecting: whether it passes stage 2, the user's decision,
 /// its ranks in two orders, the list of ids being sorted, and the sort keys.
 pub const WORKING_BYTES_PER_GAUSSIAN: usize =
     size_of::<bool>() + size_of::<Option<bool>>() + 4 * size_of::<u32>() + 2 * size_of::<f64>();
 
-/// Applies stages 1 and 2 to N scored Gaussians, then the user's overrides, and returns which Gaussians stay.
+/// Applies stages 1 and 2 to N scored Gaussians, then the user's decisions, and returns which Gaussians stay.
+/// `keep`, `drop`: ids, in any order, of Gaussians that the user keeps or drops, whatever their scores.
 ///
 /// By default a Gaussian stays if it passes both stages. Under [`LowScorePolicy::Rescue`] it stays if it passes stage
 /// 2, whether or not it passes stage 1.
@@ -85,50 +85,37 @@ pub const WORKING_BYTES_PER_GAUSSIAN: usize =
 ///
 /// # Errors
 /// Returns [`Error::Usage`] for an id that is N or larger, and for an id that is to be both kept and dropped.
-pub fn select(scores: &Scores, recipe: &SelectParams, overrides: &Overrides) -> Result<Selection> {
+pub fn select(scores: &Scores, recipe: &SelectParams, keep: &[u32], drop: &[u32]) -> Result<Selection> {
     let n = scores.score.len();
-    let forced = user_decisions(n, overrides)?;
+    let forced = user_decisions(n, keep, drop)?;
     let candidates = (recipe.keep_fraction * n as f64).round() as usize;
-    let passes = passes(scores, recipe);
-    let ordered = ranking::orders(scores, recipe, candidates, &passes);
+    let passes = passes_stage_2(scores, recipe);
+    let ranks = Ranks::new(scores, recipe, candidates, &passes);
 
     let rescue = recipe.low_priority == LowScorePolicy::Rescue;
     let mut counts = SelectionCounts { total: n, candidates, ..SelectionCounts::default() };
-    let mut keep: Vec<bool> = (0..n)
-        .map(|i| {
-            let candidate = (ordered.by_score[i] as usize) < candidates;
-            match (candidate, passes[i]) {
-                (true, true) => true,
-                (true, false) => {
-                    counts.pruned_by_stage_2 += 1;
-                    false
-                }
-                (false, true) if rescue => {
-                    counts.rescued += 1;
-                    true
-                }
-                (false, _) => {
-                    counts.pruned_by_stage_1 += 1;
-                    false
-                }
-            }
-        })
-        .collect();
-    for (keep, decision) in keep.iter_mut().zip(&forced) {
-        match decision {
-            Some(true) if !*keep => counts.forced_keep += 1,
-            Some(false) if *keep => counts.forced_drop += 1,
+    for i in 0..n {
+        let candidate = (ranks.by_score[i] as usize) < candidates;
+        let kept_by_score = passes[i] && (candidate || rescue);
+        match (candidate, kept_by_score) {
+            (true, true) => {}
+            (true, false) => counts.pruned_by_stage_2 += 1,
+            (false, true) => counts.rescued += 1,
+            (false, false) => counts.pruned_by_stage_1 += 1,
+        }
+        match forced[i] {
+            Some(true) if !kept_by_score => counts.forced_keep += 1,
+            Some(false) if kept_by_score => counts.forced_drop += 1,
             _ => {}
         }
-        *keep = decision.unwrap_or(*keep);
+        counts.kept += usize::from(forced[i].unwrap_or(kept_by_score));
     }
-    counts.kept = keep.iter().filter(|&&keep| keep).count();
-    Ok(Selection { keep, ranking: ordered.ranking(&forced), counts })
+    Ok(Selection { ranking: ranks.ranking(&forced), counts })
 }
 
 /// Returns for each Gaussian whether it passes stage 2: its normalized static or dynamic score reaches the threshold.
 /// All pass if all these scores are 0.
-fn passes(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
+fn passes_stage_2(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let Scores { static_norm, dynamic_norm, .. } = scores;
     let norms = || static_norm.iter().zip(dynamic_norm);
     let indistinguishable = norms().all(|(&static_score, &dynamic_score)| static_score == 0.0 && dynamic_score == 0.0);
@@ -141,9 +128,9 @@ fn passes(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
 
 /// Returns the user's decision for each of the `n` Gaussians: keep (`true`), drop (`false`) or none (`None`). Fails for
 /// an id that is `n` or larger, and for an id that is to be both kept and dropped.
-fn user_decisions(n: usize, overrides: &Overrides) -> Result<Vec<Option<bool>>> {
+fn user_decisions(n: usize, keep: &[u32], drop: &[u32]) -> Result<Vec<Option<bool>>> {
     let mut decisions = vec![None; n];
-    for (ids, keep) in [(&overrides.keep_ids, true), (&overrides.drop_ids, false)] {
+    for (ids, keep) in [(keep, true), (drop, false)] {
         for &id in ids {
             let Some(decision) = decisions.get_mut(id as usize) else {
                 return Err(Error::usage(format!(

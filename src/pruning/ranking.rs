@@ -9,7 +9,7 @@
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
-use crate::model::hash_id;
+use crate::model::{hash_id, inverse_permutation};
 use crate::recipe::{LowScorePolicy, SelectParams};
 use crate::statistics::score::Scores;
 
@@ -38,55 +38,54 @@ impl Ranking {
     }
 }
 
-/// Two orders of all Gaussians, from which [`Orders::ranking`] makes a ranking. An order is stored as the rank of every
-/// Gaussian, by id; rank 0 is the best.
-pub(super) struct Orders {
-    /// Rank of every Gaussian by descending score S; 0 is the best. Of equal scores, the Gaussian with the smaller hash
-    /// of its id comes first.
+/// Two ranks of every Gaussian, by id, from which [`Ranks::ranking`] makes a ranking. Rank 0 is the best.
+pub(super) struct Ranks {
+    /// Rank of every Gaussian by descending score S. Of equal scores, the Gaussian with the smaller hash of its id comes
+    /// first.
     pub(super) by_score: Vec<u32>,
-    /// Rank of every Gaussian by the criterion of stage 2, descending; 0 is the best. The criterion is
-    /// max(norm(S_static)/τ_S, norm(S_dynamic)/τ_D): the normalized static and dynamic scores, each divided by its
-    /// threshold. Ties are broken by score S.
-    by_rule: Vec<u32>,
+    /// Rank of every Gaussian by the criterion of stage 2, descending. The criterion is max(norm(S_static)/τ_S,
+    /// norm(S_dynamic)/τ_D): the normalized static and dynamic scores, each divided by its threshold. Ties are broken
+    /// by score S.
+    by_criterion: Vec<u32>,
     /// Number of Gaussians that stage 1 keeps: those with the best ranks in `by_score`. `None` under
     /// [`LowScorePolicy::Rescue`], where stage 1 excludes none.
-    stage_1: Option<usize>,
+    kept_by_stage_1: Option<usize>,
     /// Number of Gaussians that pass stage 2, whose thresholds are applied to the static and the dynamic score.
-    stage_2: usize,
+    kept_by_stage_2: usize,
 }
 
-/// Sorts all Gaussians twice: by the score of stage 1, and by the criterion of stage 2. Returns both orders.
-/// `candidates`: number of Gaussians that stage 1 keeps. `passes`: for each Gaussian, whether it passes stage 2.
-pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, passes: &[bool]) -> Orders {
-    let n = scores.score.len();
-    let mut by_score: Vec<u32> = (0..n as u32).collect();
-    // Adding 0 turns −0 into 0, which a total order would distinguish.
-    let score = |id: u32| scores.score[id as usize] + 0.0;
-    by_score.par_sort_unstable_by(|&a, &b| {
-        score(b).total_cmp(&score(a)).then_with(|| hash_id(a.into()).cmp(&hash_id(b.into())))
-    });
-    let by_score = positions(&by_score);
+impl Ranks {
+    /// Sorts all Gaussians twice: by the score of stage 1, and by the criterion of stage 2. Returns both ranks of each.
+    /// `candidates`: number of Gaussians that stage 1 keeps. `passes`: for each Gaussian, whether it passes stage 2.
+    pub(super) fn new(scores: &Scores, recipe: &SelectParams, candidates: usize, passes: &[bool]) -> Self {
+        let n = scores.score.len();
+        let mut by_score: Vec<u32> = (0..n as u32).collect();
+        // Adding 0 turns −0 into 0, which a total order would distinguish.
+        let score = |id: u32| scores.score[id as usize] + 0.0;
+        by_score.par_sort_unstable_by(|&a, &b| {
+            score(b).total_cmp(&score(a)).then_with(|| hash_id(a.into()).cmp(&hash_id(b.into())))
+        });
+        let by_score = inverse_permutation(&by_score);
 
-    let rule: Vec<f64> = (0..n)
-        .map(|i| {
-            let static_ratio = ratio(scores.static_norm[i], recipe.tau_static);
-            static_ratio.max(ratio(scores.dynamic_norm[i], recipe.tau_dynamic)) + 0.0
-        })
-        .collect();
-    let mut by_rule: Vec<u32> = (0..n as u32).collect();
-    by_rule.par_sort_unstable_by(|&a, &b| {
-        let (a, b) = (a as usize, b as usize);
-        rule[b].total_cmp(&rule[a]).then_with(|| by_score[a].cmp(&by_score[b]))
-    });
-    Orders {
-        by_rule: positions(&by_rule),
-        by_score,
-        stage_1: (recipe.low_priority == LowScorePolicy::Drop).then_some(candidates),
-        stage_2: passes.iter().filter(|&&passes| passes).count(),
+        let criterion: Vec<f64> = (0..n)
+            .map(|i| {
+                let static_ratio = ratio(scores.static_norm[i], recipe.tau_static);
+                static_ratio.max(ratio(scores.dynamic_norm[i], recipe.tau_dynamic)) + 0.0
+            })
+            .collect();
+        let mut by_criterion: Vec<u32> = (0..n as u32).collect();
+        by_criterion.par_sort_unstable_by(|&a, &b| {
+            let (a, b) = (a as usize, b as usize);
+            criterion[b].total_cmp(&criterion[a]).then_with(|| by_score[a].cmp(&by_score[b]))
+        });
+        Ranks {
+            by_criterion: inverse_permutation(&by_criterion),
+            by_score,
+            kept_by_stage_1: (recipe.low_priority == LowScorePolicy::Drop).then_some(candidates),
+            kept_by_stage_2: passes.iter().filter(|&&passes| passes).count(),
+        }
     }
-}
 
-impl Orders {
     /// Returns the ranking of all Gaussians except those that the user drops. `forced`: the user's decision for each
     /// Gaussian. Gaussians that the user keeps come first, then the others; both groups are sorted by increasing key.
     ///
@@ -95,12 +94,12 @@ impl Orders {
     ///   [`LowScorePolicy::Rescue`]);
     /// - its rank by the criterion of stage 2, from 1, divided by the number of Gaussians that pass stage 2.
     ///
-    /// The Gaussians that the recipe keeps have keys of at most 1, and all others have larger keys. The ranks come from
-    /// two orders, so keys may be equal; Gaussians with equal keys are sorted by score S.
+    /// The Gaussians that the recipe keeps have keys of at most 1, and all others have larger keys. The ranks come
+    /// from two orders, so keys may be equal; Gaussians with equal keys are sorted by score S.
     pub(super) fn ranking(&self, forced: &[Option<bool>]) -> Ranking {
         let key = |i: usize| {
-            let stage_2_ratio = rank_over(self.by_rule[i], self.stage_2);
-            self.stage_1.map_or(stage_2_ratio, |kept| stage_2_ratio.max(rank_over(self.by_score[i], kept)))
+            let stage_2_ratio = rank_over(self.by_criterion[i], self.kept_by_stage_2);
+            self.kept_by_stage_1.map_or(stage_2_ratio, |kept| stage_2_ratio.max(rank_over(self.by_score[i], kept)))
         };
         let keys: Vec<f64> = (0..forced.len()).map(key).collect();
         let mut order: Vec<u32> = (0..forced.len() as u32).filter(|&i| forced[i as usize] != Some(false)).collect();
@@ -134,13 +133,4 @@ fn ratio(x: f64, tau: f64) -> f64 {
     } else {
         f64::NEG_INFINITY
     }
-}
-
-/// Returns for every id its index in `order`, which contains each id once.
-fn positions(order: &[u32]) -> Vec<u32> {
-    let mut positions = vec![0; order.len()];
-    for (place, &id) in order.iter().enumerate() {
-        positions[id as usize] = place as u32;
-    }
-    positions
 }

@@ -11,15 +11,11 @@ use crate::passes::views::{RenderedSource, Workers};
 use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// Number of pixels to render in each view, divided by the number of Gaussians, when Gaussians are ranked by removal
-/// error (squared error of renders if one Gaussian is removed). More pixels would change the ranking less than other
-/// views would.
-const PIXELS_PER_GAUSSIAN: f64 = 1.0;
-
 /// Returns the stride n for the renders by which `count` Gaussians are ranked: only every n-th column and row of pixels
-/// is rendered. `pixels`: number of pixels of a view.
+/// is rendered, about one pixel per Gaussian. More pixels would change the ranking less than other views would.
+/// `pixels`: number of pixels of a view.
 pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
-    pixel_stride(pixels, PIXELS_PER_GAUSSIAN * count as f64)
+    pixel_stride(pixels, count as f64)
 }
 
 /// Renders only the Gaussians `ids` and returns for each of them the [`RemovalError`], the squared error that removing

@@ -19,7 +19,7 @@ use crate::models::trajectories::state_bytes;
 use crate::passes::{frames_needed_to_see_all, gather};
 use crate::pruning;
 use crate::pruning::contribution::VisibleContribution;
-use crate::pruning::{Overrides, Ranking, Selection, select};
+use crate::pruning::{Ranking, Selection, select};
 use crate::recipe::{self, NonFinitePolicy};
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
@@ -62,7 +62,8 @@ pub struct ScoreStage {
 /// that continue one another in later frames.
 const SHORT_LIFE_RATIO: usize = 4;
 
-/// Maximum fraction of Gaussians with NaN or infinity that [`NonFinitePolicy::Few`] removes.
+/// [`NonFinitePolicy::Few`] drops the Gaussians with NaN or infinity if they are at most this fraction of all Gaussians;
+/// otherwise the run stops.
 const FEW_FRACTION: f64 = 0.01;
 
 /// Result of stage `score`: statistics of every Gaussian of a scene, and a selection of those to keep.
@@ -192,8 +193,7 @@ impl ScoreStage {
                 ids.dedup();
             }
             let scores = score(&rows, info.times.len(), &self.score);
-            let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop };
-            let selection = select(&scores, &self.select, &overrides)?;
+            let selection = select(&scores, &self.select, &protected, &drop)?;
             let reference = ReferenceFrame { frame: reference_frame, extent };
             let position_ulp = ulp(scanned.largest_coordinate);
             let median_life = median_life(&rows.life);

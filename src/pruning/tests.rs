@@ -27,12 +27,17 @@ fn rule(low_priority: LowScorePolicy, keep_fraction: f64, tau_static: f64, tau_d
 }
 
 fn without_overrides(scores: &Scores, recipe: &SelectParams) -> Selection {
-    select(scores, recipe, &Overrides::default()).unwrap()
+    select(scores, recipe, &[], &[]).unwrap()
 }
 
-/// Returns for each Gaussian whether it stays, computed literally as defined: sorts all Gaussians by score, then
-/// applies the thresholds of stage 2, unless all normalized scores are 0.
-fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
+/// Returns the ids of the Gaussians that stay, increasing.
+fn kept_ids(selection: &Selection) -> Vec<u32> {
+    selection.ranking.best_ids(selection.counts.kept)
+}
+
+/// Returns the ids of the Gaussians that stay, increasing, computed literally as defined: sorts all Gaussians by score,
+/// then applies the thresholds of stage 2, unless all normalized scores are 0.
+fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<u32> {
     let n = scores.score.len();
     let mut order: Vec<usize> = (0..n).collect();
     order.sort_by(|&a, &b| {
@@ -41,11 +46,12 @@ fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let candidates = &order[..(recipe.keep_fraction * n as f64 + 0.5).floor() as usize];
     let graded = scores.static_norm.iter().chain(&scores.dynamic_norm).any(|&norm| norm != 0.0);
     (0..n)
-        .map(|i| {
+        .filter(|&i| {
             let passes =
                 !graded || scores.static_norm[i] >= recipe.tau_static || scores.dynamic_norm[i] >= recipe.tau_dynamic;
             passes && (recipe.low_priority == LowScorePolicy::Rescue || candidates.contains(&i))
         })
+        .map(|i| i as u32)
         .collect()
 }
 
@@ -63,7 +69,7 @@ fn sign_of_zero_changes_no_ranking() {
     for low_priority in [LowScorePolicy::Drop, LowScorePolicy::Rescue] {
         let recipe = rule(low_priority, 0.8, 0.05, 0.05);
         let [plus, minus] = [0.0, -0.0].map(|zero| without_overrides(&scores(&parts(zero)), &recipe));
-        assert_eq!((plus.keep, plus.ranking.order()), (minus.keep, minus.ranking.order()));
+        assert_eq!((plus.counts, plus.ranking.order()), (minus.counts, minus.ranking.order()));
     }
 }
 
@@ -86,9 +92,7 @@ proptest! {
         let mut scores = scores(&parts);
         scores.score = independent_scores[..parts.len()].to_vec();
         let selection = without_overrides(&scores, &recipe);
-        prop_assert_eq!(&selection.keep, &kept_by_definition(&scores, &recipe));
-        let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
-        prop_assert_eq!(selection.ranking.best_ids(selection.counts.kept), kept);
+        prop_assert_eq!(kept_ids(&selection), kept_by_definition(&scores, &recipe));
         prop_assert_eq!(selection.ranking.best_ids(usize::MAX), (0..parts.len() as u32).collect::<Vec<_>>());
         let counts = selection.counts;
         prop_assert_eq!(counts.kept, counts.candidates - counts.pruned_by_stage_2 + counts.rescued);
@@ -103,16 +107,13 @@ proptest! {
     ) {
         let scores = scores(&parts);
         let with = |fate| (0..parts.len() as u32).filter(|&i| decisions[i as usize] == fate).collect::<Vec<u32>>();
-        let overrides = Overrides { keep_ids: with(0), drop_ids: with(1) };
-        let selection = select(&scores, &recipe, &overrides).unwrap();
-        for (i, &natural) in without_overrides(&scores, &recipe).keep.iter().enumerate() {
-            let expected = match decisions[i] { 0 => true, 1 => false, _ => natural };
-            prop_assert_eq!(selection.keep[i], expected, "Gaussian {}", i);
-        }
-        prop_assert_eq!(selection.ranking.best_ids(overrides.keep_ids.len()), overrides.keep_ids.clone());
-        prop_assert_eq!(selection.ranking.order().len(), parts.len() - overrides.drop_ids.len());
-        let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
-        prop_assert_eq!(selection.ranking.best_ids(selection.counts.kept), kept);
+        let (keep, drop) = (with(0), with(1));
+        let selection = select(&scores, &recipe, &keep, &drop).unwrap();
+        let natural = kept_by_definition(&scores, &recipe);
+        let stays = |&id: &u32| match decisions[id as usize] { 0 => true, 1 => false, _ => natural.contains(&id) };
+        prop_assert_eq!(kept_ids(&selection), (0..parts.len() as u32).filter(stays).collect::<Vec<_>>());
+        prop_assert_eq!(selection.ranking.best_ids(keep.len()), keep);
+        prop_assert_eq!(selection.ranking.order().len(), parts.len() - drop.len());
     }
 }
 
@@ -122,14 +123,14 @@ fn kept_set_leads_the_ranking_if_the_best_fail_stage_2() {
     let mut scores = scores(&parts);
     scores.score = (0..100).map(|i| -f64::from(i)).collect();
     let selection = without_overrides(&scores, &rule(LowScorePolicy::Drop, 0.02, 0.5, 0.5));
-    assert_eq!((selection.counts.kept, selection.ranking.best_ids(1)), (1, vec![1]));
+    assert_eq!(kept_ids(&selection), [1]);
 }
 
 #[test]
 fn a_single_gaussian_is_kept() {
     for preset in ["paper", "default"] {
         let recipe = Recipe::preset(preset).unwrap().select;
-        assert_eq!(without_overrides(&scores(&[(0.0, -0.0)]), &recipe).keep, [true], "{preset}");
+        assert_eq!(without_overrides(&scores(&[(0.0, -0.0)]), &recipe).counts.kept, 1, "{preset}");
     }
 }
 
@@ -153,7 +154,7 @@ fn identical_gaussians_are_pruned_by_hashed_id() {
     let mut by_hash: Vec<u32> = (0..1001).collect();
     by_hash.sort_by_key(|&id| hash_id(id.into()));
     assert_eq!(selection.ranking.order(), by_hash);
-    let first_half = selection.keep[..500].iter().filter(|&&keep| keep).count();
+    let first_half = kept_ids(&selection).iter().filter(|&&id| id < 500).count();
     assert!((110..190).contains(&first_half), "ties must not favor a position in the file: {first_half} of 300");
 }
 
@@ -169,11 +170,8 @@ fn without_candidates_the_ranking_still_follows_the_score() {
 fn errors_name_conflicting_and_unknown_ids() {
     let scores = scores(&[(0.0, 0.0); 4]);
     let recipe = rule(LowScorePolicy::Rescue, 0.5, 0.05, 0.05);
-    for (overrides, id) in [
-        (Overrides { keep_ids: vec![1, 2], drop_ids: vec![2] }, "2"),
-        (Overrides { keep_ids: vec![7], drop_ids: vec![] }, "7"),
-    ] {
-        let message = select(&scores, &recipe, &overrides).unwrap_err().to_string();
+    for (keep, drop, id) in [(&[1, 2][..], &[2][..], "2"), (&[7], &[], "7")] {
+        let message = select(&scores, &recipe, keep, drop).unwrap_err().to_string();
         assert!(message.contains(id), "{message}");
     }
 }
@@ -181,7 +179,7 @@ fn errors_name_conflicting_and_unknown_ids() {
 #[test]
 fn no_gaussians_give_an_empty_selection() {
     let selection = without_overrides(&scores(&[]), &Recipe::preset("default").unwrap().select);
-    assert!(selection.keep.is_empty() && selection.ranking.order().is_empty());
+    assert!(selection.counts.kept == 0 && selection.ranking.order().is_empty());
 }
 
 #[test]

@@ -18,7 +18,7 @@ const NEWEST_WEIGHT: f64 = 0.1;
 const SQUARED_WEIGHT: f64 = 20.0;
 /// Wanted number of rendered pixels of a training view per survivor (Gaussian left by pruning). It determines the
 /// stride of the rendered pixels. In measurements with at least 2 pixels per survivor, refinement lost at most 0.1 dB.
-const PIXELS_PER_GAUSSIAN: f64 = 2.5;
+const PIXELS_PER_SURVIVOR: f64 = 2.5;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -64,7 +64,7 @@ impl Loss {
     pub(super) fn stride(&self, pixels: u64, survivors: usize) -> NonZeroU32 {
         match self.ssim > 0.0 {
             true => NonZeroU32::MIN,
-            false => pixel_stride(pixels, PIXELS_PER_GAUSSIAN * survivors as f64),
+            false => pixel_stride(pixels, PIXELS_PER_SURVIVOR * survivors as f64),
         }
     }
 

@@ -213,8 +213,8 @@ fn assert_merges_as_specified(recipe: &Recipe, only: PruneOrMerge) -> usize {
     let scored = score_scene(&scene, recipe, &UserOverrides::default()).unwrap();
     let all_frames = AllFrames::read(&scene);
     assert_eq!(summary.merge.unwrap().reference_frame, all_frames.reference);
-    let kept: Vec<usize> =
-        (0..map.len()).filter(|&id| only == PruneOrMerge::Merge || scored.selection.keep[id]).collect();
+    let keep = scored.selection.keep();
+    let kept: Vec<usize> = (0..map.len()).filter(|&id| only == PruneOrMerge::Merge || keep[id]).collect();
 
     let expected = clusters(&all_frames, &scored, &kept, recipe);
     let mut expected_map = vec![None; map.len()];

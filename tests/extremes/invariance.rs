@@ -63,7 +63,7 @@ impl GeneratedScene {
         };
         let scene = Scene::new(path.clone(), Box::new(Container::open(&path).unwrap()), rig, None).unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
-        Measured { rows: scored.rows().unwrap().into_owned(), keep: scored.selection.keep.clone() }
+        Measured { rows: scored.rows().unwrap().into_owned(), keep: scored.selection.keep() }
     }
 
     /// Returns a copy with `edit` applied to every Gaussian in every frame.

@@ -35,7 +35,7 @@ pub use camera::Camera;
 pub use covariance::scale_rotation;
 pub use gaussians::{AttributeValues, Attributes, Gaussians};
 pub use gradients::{GradientSpan, Gradients};
-pub use hash::hash_id;
+pub use hash::{hash_id, inverse_permutation};
 pub use jacobian::Jacobian;
 pub use ranges::format_ranges;
 pub use raw::StoredParams;

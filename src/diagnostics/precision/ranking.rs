@@ -16,8 +16,8 @@ use crate::pipeline::stages::measure::MeasureStages;
 use crate::pipeline::stages::rounds::Rounds;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score::{Scored, UserOverrides};
+use crate::pruning::select;
 use crate::pruning::visibility::VisibilityStage;
-use crate::pruning::{Overrides, select};
 use crate::recipe::{self, Recipe};
 use crate::statistics::score::percentile_sketch::MAX_MANTISSA_BITS;
 use crate::statistics::score::{PercentilePasses, ScoredQuantity, Scores, score_with_passes};
@@ -235,7 +235,7 @@ impl Bench<'_> {
         let (exact, cost) = by(PercentilePasses::Two)?;
         let staying = scored.selection.counts.kept;
         let measured = |value: f64, step: f64, scores: &Scores, cost: Cost| -> Result<TriedRanking> {
-            let selection = select(scores, &self.recipe.select, &Overrides::default())?;
+            let selection = select(scores, &self.recipe.select, &[], &[])?;
             let errors = [
                 (PERCENTILE_ERROR, worst_percentile_error(scores, &exact)),
                 (KEPT_COUNT_ERROR, relative_error(selection.counts.kept, staying)),
