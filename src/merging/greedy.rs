@@ -13,6 +13,8 @@
 
 use rayon::prelude::*;
 
+use crate::model::inverse_permutation;
+
 /// Maximum number of parallel rounds. Nodes (Gaussians or merged groups) that have no leader (node that they join)
 /// after the last round are assigned sequentially. Scenes need 5 to 8 rounds. A chain of Gaussians that are ranked in
 /// their order along a line would need one round for every two Gaussians.
@@ -50,11 +52,7 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
     order.par_sort_unstable_by(|&a, &b| {
         key(b).total_cmp(&key(a)).then(hash[a as usize].cmp(&hash[b as usize])).then(a.cmp(&b))
     });
-    let mut rank = vec![0; order.len()];
-    for (r, node) in order.into_iter().enumerate() {
-        rank[node as usize] = r as u32;
-    }
-    rank
+    inverse_permutation(&order)
 }
 
 /// Value in `leader_of` of a node that has no leader yet. For all other nodes the value is the index of the leader: the

@@ -17,7 +17,7 @@ use crate::error::Result;
 use crate::merging::motion::{MotionThresholds, NODE_BYTES, PAIR_BYTES, PairMotionAccumulator};
 use crate::merging::similarity_cache::PairSimilarity;
 use crate::merging::voxels::voxel_order;
-use crate::model::{AttributeValues, opacity};
+use crate::model::{AttributeValues, inverse_permutation, opacity};
 use crate::outputs::container::FRAME_BLOCK;
 use crate::passes::FrameReaders;
 use crate::progress::Events;
@@ -135,16 +135,11 @@ impl PairMeter<'_> {
     /// `reach`) in which their position in `reference` lies. Returns the handle of this file. Fails if the source
     /// cannot be read or the scratch file cannot be written.
     fn gather(&self, ids: &[u32], reference: &AttributeValues, reach: f64) -> Result<GatheredTrajectories> {
-        let rows: Vec<u32> = (0..ids.len() as u32).collect();
-        let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
+        let order = voxel_order(&(0..ids.len() as u32).collect::<Vec<_>>(), |row| reference.row(row as usize), reach);
         let ordered_ids: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
         let trajectories =
             Trajectories::gather(self.source, &ordered_ids, self.max_kept_frames, &self.scratch, &self.events)?;
-        let mut place = rows;
-        for (&row, k) in order.iter().zip(0u32..) {
-            place[row as usize] = k;
-        }
-        Ok(GatheredTrajectories { trajectories, order, place })
+        Ok(GatheredTrajectories { trajectories, place: inverse_permutation(&order), order })
     }
 
     /// Passes every frame of the Gaussians `ids` of the source to `motion`. Passes only the first frame if neither

@@ -27,7 +27,7 @@ use crate::merging::proxy::{Importance, weights};
 use crate::merging::similarity_cache::{PairSimilarity, SimilarityCache};
 use crate::merging::voxels::voxel_order;
 use crate::merging::{MergeResult, RequestedPairs, Survivors};
-use crate::model::{AttributeValues, Attributes, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians, inverse_permutation};
 use crate::models::trajectories::state_bytes;
 use crate::passes::{GAUSSIANS_PER_BLOCK, gather};
 use crate::pipeline::planning::Planning;
@@ -421,9 +421,7 @@ fn measure(
     }
     // Pairs are sorted by position, so that few shards read the same Gaussians.
     let rows: Vec<u32> = (0..pool.len() as u32).collect();
-    let order = voxel_order(&rows, |row| reference.row(row as usize), requested.max_distance);
-    let mut place = rows;
-    order.iter().zip(0..).for_each(|(&row, k)| place[row as usize] = k);
+    let place = inverse_permutation(&voxel_order(&rows, |row| reference.row(row as usize), requested.max_distance));
     pairs.par_sort_unstable_by_key(|&(a, b)| (place[a as usize], place[b as usize]));
     let key = work.key(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
     let (fresh, meter) = (meter.without_trajectories(), RefCell::new(meter));
