@@ -190,7 +190,7 @@ impl SearchStage {
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());
             (trial.scored, trial.ranking) = (Some(scored.clone()), Some(ranking.clone()));
-            let steps = |stage| PrunedModels::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
+            let steps = |stage| PrunedModels::new(RefineRun::new(NAME, stage, scene, &scored, &targets));
             trial.prune_steps = self.refine.as_ref().map(steps);
             let (best, tried) = self.bracket(&mut trial, &meter)?;
             if best.value.is_nan() {

@@ -19,13 +19,13 @@ pub(super) fn is_averaged(step: usize, steps: usize) -> bool {
 /// Mean of parameter deltas (values that refinement adds to the parameters). One delta is taken after every
 /// [`AVERAGE_EVERY`]-th of the last optimization steps.
 #[derive(Clone, Default, Serialize, Deserialize)]
-pub(super) struct MeanDelta<Delta> {
-    pub(super) delta: Delta,
+pub(super) struct MeanDelta {
+    pub(super) delta: ParamDelta,
     /// Number of parameter deltas of which `delta` is the mean so far.
     pub(super) count: u32,
 }
 
-impl MeanDelta<ParamDelta> {
+impl MeanDelta {
     /// Includes the parameter delta `next` in the mean.
     pub(super) fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;

@@ -194,10 +194,16 @@ impl RefineStage {
         self.loss.stride(pixels, survivors)
     }
 
-    /// Returns the number of final optimization steps (after the last prune step) for a model that keeps the fraction
-    /// `kept` of all Gaussians: [`RefineStage::steps`] · (1 − `kept`) / (1 − [`MIN_START_COUNT_FRACTION`]), at most
-    /// [`RefineStage::steps`], rounded up.
-    fn last_steps(&self, kept: f64) -> usize {
+    /// Returns the number of final steps (optimization steps after the last prune step) for a model that keeps `count`
+    /// of `all` Gaussians.
+    fn final_step_count(&self, count: usize, all: usize) -> usize {
+        self.final_step_count_for(count as f64 / all.max(1) as f64)
+    }
+
+    /// Returns the number of final steps for a model that keeps the fraction `kept` of all Gaussians:
+    /// [`RefineStage::steps`] · (1 − `kept`) / (1 − [`MIN_START_COUNT_FRACTION`]), at most [`RefineStage::steps`],
+    /// rounded up.
+    fn final_step_count_for(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - MIN_START_COUNT_FRACTION)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
     }
@@ -224,12 +230,6 @@ impl RefineStage {
     /// surplus; `None` if there are no prune steps.
     pub fn min_start_count_fraction(&self) -> Option<f64> {
         self.prunes.then_some(MIN_START_COUNT_FRACTION)
-    }
-
-    /// Returns the number of Gaussians with which refinement begins, given that it ends with `target_count` of the
-    /// `all` Gaussians of the model. Prune steps remove the difference.
-    pub fn initial_count(&self, target_count: usize, all: usize) -> usize {
-        start_count(self.min_start_count_fraction(), target_count, all)
     }
 
     /// Returns the resource estimate (bytes of memory, seconds) of refinement for the input `work`. The memory holds
@@ -288,16 +288,18 @@ impl RefineStage {
         let own = if work.frame_views > 0 { own.min(work.frame_views as usize) } else { own };
         let (target_views, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
+        let last_count = (wanted * 1e6) as usize;
         let prune_counts =
-            prune_counts(self.initial_count((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
-        let steps = self.last_steps(wanted) + if keyframe_count > 0 { along_time(self.last_steps(wanted)) } else { 0 };
+            prune_counts(start_count(self.min_start_count_fraction(), last_count, 1_000_000), last_count);
+        let final_steps = self.final_step_count_for(wanted);
+        let steps = final_steps + if keyframe_count > 0 { along_time(final_steps) } else { 0 };
         let validations = if self.validates { 4.0 } else { 2.0 };
         let validation_renders = target_views / targets::validation_every(own + between) as f64 * validations;
         let seconds = |(k, &size): (usize, &usize)| {
-            let (count, left) = (size as f64 / 1e6 * work.gaussian_count(), (wanted * 1e6) as usize);
+            let count = size as f64 / 1e6 * work.gaussian_count();
             let (steps, renders, ranked) = match k + 1 == prune_counts.len() {
                 true => (steps, validation_renders, 0.0),
-                false => (self.steps_before(size, left), RATE_VIEWS as f64, RANKING_VIEWS as f64),
+                false => (self.steps_before(size, last_count), RATE_VIEWS as f64, RANKING_VIEWS as f64),
             };
             // With a deformation field, states and their Jacobians take twice as long to evaluate as states alone.
             let found = if work.input.jacobian > 0 { 2.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };

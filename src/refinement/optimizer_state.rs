@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use std::num::NonZeroU32;
 
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
 use super::loss::{Loss, RenderQuality, limit_slope};
@@ -105,15 +105,21 @@ pub(super) struct OptimizerState<'a> {
     reevaluated: bool,
 }
 
-/// Contents of a checkpoint of an [`OptimizerState`], in this order:
-/// - the stored parameters at the last evaluation of the frame states, and the delta that they include; `None` if the
-///   frame states were not evaluated again after `constant_optimizer` was created,
-/// - delta, running means and step number of `constant_optimizer`,
-/// - number of steps since the frame states were evaluated,
-/// - running mean square of the derivatives with respect to color values,
-/// - delta, running means and step number of the optimizer of each keyframe.
-type OptimizerCheckpoint<Stored, Added, Means> =
-    (Option<(Stored, Added)>, (Added, Means, usize), usize, Option<f64>, Vec<(Added, Means, usize)>);
+/// Contents of a checkpoint of an [`OptimizerState`].
+#[derive(Serialize, Deserialize)]
+pub(super) struct OptimizerCheckpoint<Stored, Added, Means> {
+    /// Stored parameters at the last evaluation of the frame states, and the delta that they include; `None` if the
+    /// frame states were not evaluated again after `constant_optimizer` was created.
+    reevaluated: Option<(Stored, Added)>,
+    /// Delta, running means and step number of the optimizer of the stored parameters.
+    constant_optimizer: (Added, Means, usize),
+    /// Number of steps since the frame states were evaluated.
+    steps: usize,
+    /// Running mean square of the derivatives with respect to color values.
+    mean_square_slope: Option<f64>,
+    /// Delta, running means and step number of the optimizer of each keyframe.
+    keyframe_optimizers: Vec<(Added, Means, usize)>,
+}
 
 /// Contents of a checkpoint ([`OptimizerCheckpoint`]), read back from the cache.
 pub(super) type LoadedCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
@@ -292,40 +298,32 @@ impl<'a> OptimizerState<'a> {
 
     /// Returns the contents of a checkpoint, from which [`OptimizerState::resume`] continues.
     pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
-        let reevaluated = self.reevaluated.then_some((&self.stored, &self.baked_delta));
-        let keyframe_optimizers = self.keyframe_optimizers.iter().map(Adam::checkpoint).collect();
-        let checkpoint: OptimizerCheckpoint<&StoredParams, &ParamDelta, &[Gaussians; 2]> = (
-            reevaluated,
-            self.constant_optimizer.checkpoint(),
-            self.steps,
-            self.mean_square_slope,
-            keyframe_optimizers,
-        );
-        checkpoint
+        OptimizerCheckpoint {
+            reevaluated: self.reevaluated.then_some((&self.stored, &self.baked_delta)),
+            constant_optimizer: self.constant_optimizer.checkpoint(),
+            steps: self.steps,
+            mean_square_slope: self.mean_square_slope,
+            keyframe_optimizers: self.keyframe_optimizers.iter().map(Adam::checkpoint).collect(),
+        }
     }
 
-    /// Continues from a checkpoint (elements: see [`OptimizerCheckpoint`]). The run that wrote it must have started
-    /// with the same model and removed the same Gaussians.
+    /// Continues from a checkpoint. The run that wrote it must have started with the same model and removed the same
+    /// Gaussians.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
-    pub(super) fn resume(
-        &mut self,
-        (reevaluated, constant_optimizer, steps, mean_square_slope, keyframe_optimizers): LoadedCheckpoint,
-    ) -> Result<()> {
-        if let Some((stored, baked_delta)) = reevaluated {
+    pub(super) fn resume(&mut self, checkpoint: LoadedCheckpoint) -> Result<()> {
+        if let Some((stored, baked_delta)) = checkpoint.reevaluated {
             self.constant_optimizer.take_delta();
             (self.stored, self.baked_delta) = (stored, baked_delta);
             self.reevaluate_states()?;
         }
-        self.constant_optimizer.resume(constant_optimizer);
-        (self.steps, self.mean_square_slope) = (steps, mean_square_slope);
-        if !keyframe_optimizers.is_empty() {
-            self.enable_keyframes(keyframe_optimizers.len());
-            self.keyframe_optimizers
-                .iter_mut()
-                .zip(keyframe_optimizers)
-                .for_each(|(keyframe, checkpoint)| keyframe.resume(checkpoint));
+        self.constant_optimizer.resume(checkpoint.constant_optimizer);
+        (self.steps, self.mean_square_slope) = (checkpoint.steps, checkpoint.mean_square_slope);
+        let keyframes = checkpoint.keyframe_optimizers;
+        if !keyframes.is_empty() {
+            self.enable_keyframes(keyframes.len());
+            self.keyframe_optimizers.iter_mut().zip(keyframes).for_each(|(optimizer, saved)| optimizer.resume(saved));
         }
         Ok(())
     }

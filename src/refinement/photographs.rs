@@ -77,7 +77,7 @@ impl RefineStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let count = compressed.len();
-        if self.last_steps(count as f64 / scored.gaussian_count().max(1) as f64) == 0 {
+        if self.final_step_count(count, scored.gaussian_count()) == 0 {
             journal.leave_out(FIT, "no Gaussians were removed");
             return Ok(compressed);
         }
@@ -86,12 +86,10 @@ impl RefineStage {
         journal.run_cached_stage(NAME, count, scene, key, |journal| {
             let stride = self.stride(scene.workload().pixels, count);
             let targets = Targets::with_photographs(scene, self.target_views, stride, (seen, photographs))?;
-            let parts = targets.split();
-            let held_back = parts.validation.len();
+            let held_back = targets.split().validation.len();
             // The notes of a refinement are about renders of the original, so they are not taken over.
             let mut own = Journal::default();
-            let result =
-                RefineRun::new(NAME, self, scene, scored, &targets, parts).refine_best(compressed, &mut own)?;
+            let result = RefineRun::new(NAME, self, scene, scored, &targets).refine_best(compressed, &mut own)?;
             match own.refined {
                 Some(found) => {
                     let (before, result) = (found.before, found.result);

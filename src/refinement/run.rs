@@ -36,9 +36,10 @@ const MIN_KEYFRAME_GAIN: f64 = 0.01;
 /// Factor applied to the learning rates when the optimization steps since the last validation have not improved the
 /// quality of the validation views.
 const RATE_REDUCTION: f32 = 0.3;
-/// Learning rate at the last optimization step of a phase, divided by the learning rate at its first step. First value:
-/// phase of the steps before a prune step; second value: phase of the final steps.
-const LAST_RATES: [f32; 2] = [1.0, 0.5];
+/// Learning rate at the last of the optimization steps before a prune step, divided by the rate at the first of them.
+const LAST_RATE_BEFORE_PRUNING: f32 = 1.0;
+/// Learning rate at the last of the final steps, divided by the rate at the first of them.
+const LAST_RATE_OF_FINAL_STEPS: f32 = 0.5;
 
 impl RefineStage {
     /// Prunes the model `compressed` in prune steps to `target_count` Gaussians and refines it. Returns the model with
@@ -57,7 +58,7 @@ impl RefineStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let count = compressed.len();
-        let steps = self.last_steps(target_count as f64 / scored.gaussian_count().max(1) as f64);
+        let steps = self.final_step_count(target_count, scored.gaussian_count());
         if count == 0 || scene.schedule.pair_count() == 0 {
             journal.leave_out("refinement", "there are no Gaussians or no views");
             return Ok(compressed);
@@ -72,7 +73,7 @@ impl RefineStage {
                 let targets =
                     Targets::new(scene, self.target_views, self.stored_stride(scene.workload().pixels, count), false)?;
                 scene.work.end_shard_run_before(NAME)?;
-                let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.split());
+                let mut run = RefineRun::new(NAME, self, scene, scored, &targets);
                 Ok((run.run_all(&compressed, target_count, steps, journal)?.0, target_count))
             })
         };
@@ -94,8 +95,8 @@ impl RefineStage {
         compressed: &CompressedModel,
         target_count: usize,
     ) -> Result<f64> {
-        let steps = self.last_steps(target_count as f64 / scored.gaussian_count().max(1) as f64);
-        let mut run = RefineRun::new(stage, self, scene, scored, targets, targets.split());
+        let steps = self.final_step_count(target_count, scored.gaussian_count());
+        let mut run = RefineRun::new(stage, self, scene, scored, targets);
         let key = run.key(compressed, target_count, target_count).extended_by(&steps);
         let all = || Ok(run.run_all(compressed, target_count, steps, &mut Journal::default())?.1);
         scene.work.get_or_compute(&format!("{stage}-size"), key, all)
@@ -187,40 +188,38 @@ struct ResumePoint<Checkpoint, Best> {
 /// Parameter deltas (values that refinement adds to the model) that have had the best validation quality in the final
 /// optimization steps.
 #[derive(Clone, Serialize, Deserialize)]
-struct BestState<Delta, Trajectory> {
+struct BestState {
     before: RenderQuality,
     best: RenderQuality,
     /// Best validation quality so far of renders without the trajectory delta (values that vary with time).
     constant: RenderQuality,
     /// Constant delta (values added to the stored parameters) that has had the best validation quality so far.
-    delta: Delta,
+    delta: ParamDelta,
     /// Factor on the learning rates, reduced at each validation (except the last) that shows no better quality than the
     /// best so far.
     rate_factor: f32,
     /// Trajectory delta: the time-varying values, added to each frame, that have had the best validation quality so far
     /// together with `delta`.
-    trajectory: Trajectory,
-    mean: MeanDelta<Delta>,
+    trajectory: TrajectoryDelta,
+    mean: MeanDelta,
 }
 
 /// Progress of a phase that continues from a checkpoint: number of optimization steps done, learning rates, and, in the
 /// final steps, the best parameter deltas (added values) so far.
-type Resumed = (usize, RateSchedule, Option<BestState<ParamDelta, TrajectoryDelta>>);
+type Resumed = (usize, RateSchedule, Option<BestState>);
 
 impl<'a> RefineRun<'a> {
-    /// Creates a refinement that the stage named `stage` runs. `refine`: parameters. `targets`: target views. `parts`:
-    /// indices of the training and validation views among the target views.
+    /// Creates a refinement that the stage named `stage` runs. `refine`: parameters. `targets`: target views.
     pub(crate) fn new(
         stage: &'static str,
         refine: &'a RefineStage,
         scene: &'a Scene,
         scored: &'a Scored,
         targets: &'a Targets,
-        parts: ViewSplit,
     ) -> RefineRun<'a> {
-        let views = (&parts.training, &parts.validation);
-        let key = targets.key.extended_by(&(refine.key(), views, &scored.protected));
-        let (sampler, validation) = (EpochSampler::new(parts.training), parts.validation);
+        let ViewSplit { training, validation, .. } = targets.split();
+        let key = targets.key.extended_by(&(refine.key(), (&training, &validation), &scored.protected));
+        let sampler = EpochSampler::new(training);
         let progress = scene.events.task(stage, "steps", 0);
         RefineRun { refine, scene, scored, targets, sampler, validation, stage, progress, key }
     }
@@ -310,7 +309,7 @@ impl<'a> RefineRun<'a> {
         mut compressed: CompressedModel,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let steps = self.refine.last_steps(compressed.len() as f64 / self.scored.gaussian_count().max(1) as f64);
+        let steps = self.refine.final_step_count(compressed.len(), self.scored.gaussian_count());
         let (key, work) = (self.key(&compressed, compressed.len(), compressed.len()), &self.scene.work);
         let (change, course, taken) = journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
             self.set_total_steps(steps + self.steps_along_time(steps));
@@ -361,7 +360,7 @@ impl<'a> RefineRun<'a> {
     /// Restores the optimizer and the position in the random order of views from the last checkpoint of the current
     /// phase of `timer`. Returns the progress of this phase, or `None` if there is no checkpoint of it.
     fn resume(&mut self, optimizer: &mut OptimizerState<'_>, timer: &CheckpointTimer) -> Result<Option<Resumed>> {
-        let kept: Option<ResumePoint<LoadedCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
+        let kept: Option<ResumePoint<LoadedCheckpoint, BestState>> =
             self.scene.work.load(&self.checkpoint_name(), timer.key)?;
         let Some(kept) = kept.filter(|kept| kept.phase == timer.phase) else { return Ok(None) };
         optimizer.resume(kept.checkpoint)?;
@@ -379,7 +378,7 @@ impl<'a> RefineRun<'a> {
         optimizer: &OptimizerState<'_>,
         timer: &mut CheckpointTimer,
         (steps, schedule): (usize, RateSchedule),
-        best_state: Option<BestState<&ParamDelta, &TrajectoryDelta>>,
+        best_state: Option<&BestState>,
     ) -> Result<()> {
         if !self.scene.work.is_enabled() || timer.saved_at.elapsed() < timer.interval {
             return Ok(());
@@ -419,7 +418,7 @@ impl<'a> RefineRun<'a> {
                     None => {
                         let some = self.validation.iter().step_by(self.validation.len().div_ceil(RATE_VIEWS).max(1));
                         let start = optimizer.quality(&some.copied().collect::<Vec<_>>())?;
-                        (0, RateSchedule::new(steps, LAST_RATES[0], start.typical_error()))
+                        (0, RateSchedule::new(steps, LAST_RATE_BEFORE_PRUNING, start.typical_error()))
                     }
                 };
                 for step in done..steps {
@@ -447,28 +446,25 @@ impl<'a> RefineRun<'a> {
         timer: &mut CheckpointTimer,
         steps: usize,
         journal: &mut Journal,
-    ) -> Result<BestState<ParamDelta, TrajectoryDelta>> {
+    ) -> Result<BestState> {
         let count = self.validation.len();
         let (done, mut schedule, mut best_state) = match self.resume(optimizer, timer)? {
             Some((done, schedule, Some(best_state))) => (done, schedule, best_state),
             _ => {
                 optimizer.reevaluate_states()?;
                 let before = optimizer.quality(&self.validation)?;
-                if before.psnr.is_nan() {
-                    let why = format!("the PSNR of the {count} validation views is {}", decibels_text(before.psnr, 2));
+                let best_state = BestState::new(before, optimizer.change());
+                if before.psnr.is_nan() || before.psnr >= MAX_USEFUL_PSNR {
+                    let why = match before.psnr.is_nan() {
+                        true => {
+                            format!("the PSNR of the {count} validation views is {}", decibels_text(before.psnr, 2))
+                        }
+                        false => format!("the {count} validation views have {:.2} dB PSNR without it", before.psnr),
+                    };
                     journal.leave_out("refinement", why);
-                    return Ok(BestState::new(before, optimizer.change()));
+                    return Ok(best_state);
                 }
-                if before.psnr >= MAX_USEFUL_PSNR {
-                    let why = format!("the {count} validation views have {:.2} dB PSNR without it", before.psnr);
-                    journal.leave_out("refinement", why);
-                    return Ok(BestState::new(before, optimizer.change()));
-                }
-                (
-                    0,
-                    RateSchedule::new(steps, LAST_RATES[1], before.typical_error()),
-                    BestState::new(before, optimizer.change()),
-                )
+                (0, RateSchedule::new(steps, LAST_RATE_OF_FINAL_STEPS, before.typical_error()), best_state)
             }
         };
         let validate_every = steps.div_ceil(3).clamp(VALIDATE_EVERY[0], VALIDATE_EVERY[1]);
@@ -490,12 +486,13 @@ impl<'a> RefineRun<'a> {
                     best_state.mean = MeanDelta::default();
                     best_state.rate_factor *= RATE_REDUCTION;
                     optimizer.restart_from(&best_state.delta)?;
-                    schedule = RateSchedule::new(steps - step, LAST_RATES[1], best_state.best.typical_error())
-                        .scaled_by(best_state.rate_factor);
+                    schedule =
+                        RateSchedule::new(steps - step, LAST_RATE_OF_FINAL_STEPS, best_state.best.typical_error())
+                            .scaled_by(best_state.rate_factor);
                 }
             }
             best_state.constant = best_state.best;
-            self.save_checkpoint(optimizer, timer, (step, schedule), Some(best_state.checkpoint()))?;
+            self.save_checkpoint(optimizer, timer, (step, schedule), Some(&best_state))?;
         }
         let is_along = self.refine_along_time(optimizer, timer, (done, schedule), &mut best_state, steps)?;
         let [start, best] = [best_state.before.psnr, best_state.best.psnr];
@@ -535,7 +532,7 @@ impl<'a> RefineRun<'a> {
         optimizer: &mut OptimizerState<'_>,
         timer: &mut CheckpointTimer,
         (done, mut schedule): (usize, RateSchedule),
-        best_state: &mut BestState<ParamDelta, TrajectoryDelta>,
+        best_state: &mut BestState,
         steps: usize,
     ) -> Result<bool> {
         let keyframe_steps = self.steps_along_time(steps);
@@ -549,7 +546,11 @@ impl<'a> RefineRun<'a> {
                 return Ok(false);
             }
             // Every view changes the two keyframes around its frame, so this is the mean number of steps per keyframe.
-            schedule = RateSchedule::new(2 * keyframe_steps / keyframe_count, LAST_RATES[1], best_state.constant.error);
+            schedule = RateSchedule::new(
+                2 * keyframe_steps / keyframe_count,
+                LAST_RATE_OF_FINAL_STEPS,
+                best_state.constant.error,
+            );
         }
         let validate_every = keyframe_steps.div_ceil(3);
         for step in done.saturating_sub(steps) + 1..=keyframe_steps {
@@ -562,13 +563,13 @@ impl<'a> RefineRun<'a> {
                     (best_state.best, best_state.trajectory) = (now, optimizer.trajectory_delta());
                 }
             }
-            self.save_checkpoint(optimizer, timer, (steps + step, schedule), Some(best_state.checkpoint()))?;
+            self.save_checkpoint(optimizer, timer, (steps + step, schedule), Some(best_state))?;
         }
         Ok(true)
     }
 }
 
-impl BestState<ParamDelta, TrajectoryDelta> {
+impl BestState {
     /// Creates the best state before any optimization step: `delta` is the change of the parameters so far, and
     /// `before` the validation quality with this change.
     fn new(before: RenderQuality, delta: ParamDelta) -> Self {
@@ -581,12 +582,5 @@ impl BestState<ParamDelta, TrajectoryDelta> {
             trajectory: TrajectoryDelta::default(),
             mean: MeanDelta::default(),
         }
-    }
-
-    /// Returns a version of this state for a checkpoint, which borrows the parameter deltas instead of copying them.
-    fn checkpoint(&self) -> BestState<&ParamDelta, &TrajectoryDelta> {
-        let BestState { before, best, constant, ref delta, rate_factor, ref trajectory, ref mean } = *self;
-        let mean = MeanDelta { delta: &mean.delta, count: mean.count };
-        BestState { before, best, constant, delta, rate_factor, trajectory, mean }
     }
 }
