@@ -63,8 +63,8 @@ impl RenderedAttributes {
     /// applied.
     pub fn from_state(state: &Gaussians, row: usize) -> RenderedAttributes {
         RenderedAttributes {
-            position: state.position.row::<3>(row).map(f64::from),
-            scale: state.log_scale.row::<3>(row).map(|scale| f64::from(scale).exp()),
+            position: state.position_f64(row),
+            scale: state.scales_f64(row),
             opacity: opacity(state.opacity_logit.row::<1>(row)[0]),
             color: state.sh.row::<3>(row).map(color_from_sh),
         }

@@ -164,7 +164,7 @@ type WriteArray = fn(&Gaussians, f64, &mut dyn Write) -> std::io::Result<()>;
 const ARRAYS: [WriteArray; 6] = [
     |state, unit, out| {
         (0..state.len()).try_for_each(|row| {
-            let [x, y, z] = state.position.row::<3>(row).map(f64::from);
+            let [x, y, z] = state.position_f64(row);
             [x, -y, -z].into_iter().try_for_each(|value| out.write_all(&fixed(value, unit).to_le_bytes()[..3]))
         })
     },
@@ -176,7 +176,7 @@ const ARRAYS: [WriteArray; 6] = [
     |state, _, out| (0..state.len()).try_for_each(|row| out.write_all(&state.log_scale.row::<3>(row).map(scale_byte))),
     |state, _, out| {
         (0..state.len()).try_for_each(|row| {
-            let q = state.rotation.row::<4>(row).map(f64::from);
+            let q = state.rotation_f64(row);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             let [w, x, y, z] = if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] };
             out.write_all(&smallest_three([x, -y, -z, w]).to_le_bytes())
@@ -383,7 +383,7 @@ mod tests {
                     assert!((a - b).abs() <= within, "{what} of {row}: {a}, expected {b}");
                 }
             };
-            let [x, y, z] = state.position.row::<3>(row).map(f64::from);
+            let [x, y, z] = state.position_f64(row);
             near(&place, &[x, -y, -z], 1.01 * position_error, "position");
             near(&[visible], &[opacity(state.opacity_logit.row::<1>(row)[0])], 0.5 / 255.0, "opacity");
             let dc = state.sh.row::<3>(row).map(f64::from);
@@ -394,7 +394,7 @@ mod tests {
                 0.51 / 16.0,
                 "scale",
             );
-            let r = state.rotation.row::<4>(row).map(f64::from);
+            let r = state.rotation_f64(row);
             let length = r.iter().map(|x| x * x).sum::<f64>().sqrt();
             let turned = [r[0], r[1], -r[2], -r[3]].map(|x| x / length);
             let dot: f64 = q.iter().zip(turned).map(|(a, b)| a * b).sum();

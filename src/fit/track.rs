@@ -31,8 +31,8 @@ impl FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];
         for state in states {
-            track.position.push(state.position.row::<3>(row).map(f64::from));
-            let q = state.rotation.row::<4>(row).map(f64::from);
+            track.position.push(state.position_f64(row));
+            let q = state.rotation_f64(row);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             let dot: f64 = q.iter().zip(last).map(|(a, b)| a * b).sum();
             // A quaternion of length zero or infinity is replaced by the previous rotation.

@@ -81,7 +81,7 @@ impl Appearance {
         }
         let dc = DVec3::from(states.sh.row::<3>(i).map(f64::from));
         Appearance {
-            position: DVec3::from(states.position.row::<3>(i).map(f64::from)),
+            position: DVec3::from(states.position_f64(i)),
             rotation: unit_rotation(states.rotation.row(i)),
             log_scale: sorted,
             scales: DVec3::from(log_scale.map(f64::exp)),

@@ -30,7 +30,7 @@ impl MergeGroups {
         }
         let joined = |group: usize| new_index[leader_of[group] as usize] as usize;
         let mut start = vec![0; leaders.len() + 1];
-        for group in 0..self.len() {
+        for group in 0..self.group_count() {
             start[joined(group) + 1] += self.members(group).len() as u32;
         }
         for group in 0..leaders.len() {
@@ -38,7 +38,7 @@ impl MergeGroups {
         }
         let mut next = start.clone();
         let mut members = vec![0; self.members.len()];
-        for group in 0..self.len() {
+        for group in 0..self.group_count() {
             let (place, group_members) = (&mut next[joined(group)], self.members(group));
             members[*place as usize..][..group_members.len()].copy_from_slice(group_members);
             *place += group_members.len() as u32;
@@ -50,13 +50,8 @@ impl MergeGroups {
     }
 
     /// Returns the number of groups.
-    pub fn len(&self) -> usize {
+    pub fn group_count(&self) -> usize {
         self.leaders.len()
-    }
-
-    /// Returns whether there are no groups.
-    pub fn is_empty(&self) -> bool {
-        self.leaders.is_empty()
     }
 
     /// Returns the row of every group's leader, the Gaussian into which the others are merged; rows are increasing.
@@ -72,7 +67,7 @@ impl MergeGroups {
 
     /// Returns the indices of the groups that have more than one Gaussian.
     pub fn clusters(&self) -> impl Iterator<Item = u32> {
-        (0..self.len() as u32).filter(|&group| self.members(group as usize).len() > 1)
+        (0..self.group_count() as u32).filter(|&group| self.members(group as usize).len() > 1)
     }
 }
 
@@ -87,8 +82,8 @@ mod tests {
         assert_eq!(once.leaders(), [1, 3, 5]);
         assert_eq!((once.members(0), once.members(1), once.members(2)), (&[1][..], &[3][..], &[2, 4, 5][..]));
         let twice = once.joined(&[0, 1, 0]);
-        assert_eq!((twice.leaders(), twice.len()), (&[1, 3][..], 2));
+        assert_eq!((twice.leaders(), twice.group_count()), (&[1, 3][..], 2));
         assert_eq!((twice.members(0), twice.members(1)), (&[1, 2, 4, 5][..], &[3][..]));
-        assert!(MergeGroups::singletons(&[]).joined(&[]).is_empty());
+        assert_eq!(MergeGroups::singletons(&[]).joined(&[]).group_count(), 0);
     }
 }

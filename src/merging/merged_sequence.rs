@@ -9,10 +9,8 @@
 
 use std::ops::Range;
 
-use rayon::prelude::*;
-
 use crate::error::Result;
-use crate::merging::proxy::{ProxyState, merge_member_states};
+use crate::merging::proxy::{for_each_proxy, merge_member_states};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::passes::FrameReaders;
 use crate::recipe::{MergeParams, ProxyPosition};
@@ -22,10 +20,6 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 /// Position, rotation and scale follow from mean and covariance of the members; the opacity follows from the members'
 /// opacities and areas.
 const MIXED: Attributes = Attributes::all().difference(Attributes::SH);
-
-/// Number of proxies (Gaussians that replace merged clusters) that are computed before their values are written to the
-/// output.
-const BATCH: usize = 4096;
 
 /// Sequence of the survivors (Gaussians left by pruning) of a source, in which a proxy replaces each merged cluster.
 pub struct MergedSequence<'a> {
@@ -168,15 +162,10 @@ impl MergedMembers {
         if want.is_empty() {
             return;
         }
-        for batch in self.proxies.chunks(BATCH) {
-            let made: Vec<ProxyState> = batch
-                .par_iter()
-                .map(|proxy| {
-                    merge_member_states(&self.members[proxy.members.clone()], state, self.rows[proxy.row], merge, want)
-                })
-                .collect();
-            batch.iter().zip(&made).for_each(|(proxy, made)| made.write(want, proxy.row, out));
-        }
+        let compute = |proxy: &Proxy| {
+            merge_member_states(&self.members[proxy.members.clone()], state, self.rows[proxy.row], merge, want)
+        };
+        for_each_proxy(&self.proxies, compute, |proxy, state| state.write(want, proxy.row, out));
     }
 }
 

@@ -185,26 +185,11 @@ pub fn run<E>(
         for coincident in [true, false] {
             let rank = ranks(&groups, importance);
             let nodes = MergeNodes::new(survivors, &groups, &proxies);
-            let mut pairs = Vec::new();
-            let take = |some: &[(u32, u32)], is_part| {
-                let request =
-                    RequestedPairs { pairs: some, row: groups.leaders(), max_distance: pass.epsilon * unit, is_part };
-                let likeness = measure(request)?;
-                debug_assert_eq!(likeness.len(), some.len(), "one likeness per pair");
-                let alike = some.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
-                pairs.extend(alike.map(|(&pair, _)| pair));
-                counts.candidates += some.len();
-                Ok::<_, E>(())
-            };
-            if coincident {
-                each_coincident(&nodes, &rank, &AppearanceThresholds::new(recipe, pass), most_pairs, take)?;
-                if pairs.is_empty() {
-                    continue;
-                }
-            } else {
-                counts.truncated = each_candidate(&nodes, &rank, recipe, (pass, unit), most_pairs, take)?;
+            let kind = (coincident, most_pairs);
+            let pairs = find_pairs(&nodes, &rank, recipe, (pass, unit), kind, &mut counts, &mut measure)?;
+            if coincident && pairs.is_empty() {
+                continue;
             }
-            counts.passing += pairs.len();
             let clustering = greedy::cluster(&rank, pairs, remaining_joins);
             remaining_joins = remaining_joins.map(|joins| joins - clustering.joins);
             counts.joins += clustering.joins;
@@ -221,12 +206,43 @@ pub fn run<E>(
     Ok(MergeResult { groups, proxies, passes })
 }
 
+/// Finds the pairs (leader, member) of `nodes` that pass all tests of a merging pass: pairs of coincident nodes if
+/// `coincident`, otherwise pairs of neighbors. Adds the numbers of pairs to `counts`. For the other arguments see
+/// [`run`] and [`each_candidate`].
+fn find_pairs<E>(
+    nodes: &MergeNodes<'_>,
+    rank: &[u32],
+    recipe: &recipe::MergeParams,
+    (pass, unit): (&recipe::MergePass, f64),
+    (coincident, most_pairs): (bool, usize),
+    counts: &mut PassCounts,
+    measure: &mut impl FnMut(RequestedPairs<'_>) -> Result<Vec<f64>, E>,
+) -> Result<Vec<(u32, u32)>, E> {
+    let (row, max_distance) = (nodes.groups.leaders(), pass.epsilon * unit);
+    let mut passing = Vec::new();
+    let take = |pairs: &[(u32, u32)], is_part| {
+        let likeness = measure(RequestedPairs { pairs, row, max_distance, is_part })?;
+        debug_assert_eq!(likeness.len(), pairs.len(), "one likeness per pair");
+        let alike = pairs.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
+        passing.extend(alike.map(|(&pair, _)| pair));
+        counts.candidates += pairs.len();
+        Ok(())
+    };
+    if coincident {
+        each_coincident(nodes, rank, &AppearanceThresholds::new(recipe, pass), most_pairs, take)?;
+    } else {
+        counts.truncated = each_candidate(nodes, rank, recipe, (pass, unit), most_pairs, take)?;
+    }
+    counts.passing += passing.len();
+    Ok(passing)
+}
+
 /// Returns the rank of each of `groups`, from 0. Groups are ranked by the sum of the contributions C of their Gaussians
 /// (from `importance`), largest first. Ties are broken by the hash of the id of the leader, the Gaussian into which the
 /// others are merged.
 fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
-    let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
+    let sizes: Vec<f64> = (0..groups.group_count()).map(size).collect();
     let hash = |&row: &u32| hash_id(importance.ids[row as usize].into());
     let hashes: Vec<u64> = groups.leaders().iter().map(hash).collect();
     greedy::ranks(&sizes, &hashes)

@@ -113,7 +113,7 @@ impl MotionThresholds {
 
 /// Position of a node (Gaussian or merged group) at the current, the previous and the reference frame, and whether it
 /// is alive (opacity ≥ alpha_min) in the current and in the previous frame.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct NodeTrack {
     reference: [f32; 3],
     current: [f32; 3],
@@ -122,7 +122,7 @@ struct NodeTrack {
     alive_previously: bool,
 }
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct NodePair {
     nodes: (u32, u32),
     cosines: f64,
@@ -156,28 +156,13 @@ impl PairMotionAccumulator {
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
         motion: MotionParams,
     ) -> Self {
-        let track = |reference| NodeTrack {
-            reference,
-            current: reference,
-            previous: reference,
-            alive: false,
-            alive_previously: false,
-        };
-        let fresh = NodePair {
-            nodes: (0, 0),
-            cosines: 0.0,
-            dot: 0.0,
-            squares: 0.0,
-            steps: 0,
-            common: 0,
-            union: 0,
-            drift_squared: 0.0,
-        };
+        let track =
+            |reference| NodeTrack { reference, current: reference, previous: reference, ..NodeTrack::default() };
         PairMotionAccumulator {
             motion,
             frames: 0,
             tracks: reference.map(track).collect(),
-            pairs: pairs.map(|nodes| NodePair { nodes, ..fresh }).collect(),
+            pairs: pairs.map(|nodes| NodePair { nodes, ..NodePair::default() }).collect(),
         }
     }
 

@@ -125,14 +125,15 @@ pub fn merge_member_states(
 ) -> ProxyState {
     // All values are relative to the leader. Thus coordinates far from the origin cancel once, and the Jacobi iteration
     // starts from the leader's axes and rotates them only as far as the other members require.
-    let origin = position(states, leader);
+    let position = |i: u32| DVec3::from(states.position_f64(i as usize));
+    let origin = position(leader);
     let frame = unit_rotation(states.rotation.row(leader as usize));
     let part = |&(i, weight): &(u32, f64)| {
         let rotation = unit_rotation(states.rotation.row(i as usize));
         let relative = if rotation == frame { DQuat::IDENTITY } else { (frame.inverse() * rotation).normalize() };
         WeightedGaussian {
             weight,
-            position: frame.inverse() * (position(states, i) - origin),
+            position: frame.inverse() * (position(i) - origin),
             rotation: relative,
             scales: scales(states, i),
         }
@@ -168,30 +169,35 @@ pub fn merge_groups(
     let clusters: Vec<u32> = groups.clusters().collect();
     let mut out = states.pick(&[]);
     out.resize(clusters.len());
-    for (batch, first) in clusters.chunks(BATCH).zip((0..).step_by(BATCH)) {
-        let proxies: Vec<ProxyState> = batch
-            .par_iter()
-            .map(|&group| {
-                let group = group as usize;
-                let rows = groups.members(group);
-                let weights = weights(rows, importance, states);
-                let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
-                merge_member_states(&members, states, groups.leaders()[group], merge, Attributes::all())
-            })
-            .collect();
-        for (row, proxy) in (first..).zip(&proxies) {
-            proxy.write(Attributes::all(), row, &mut out);
-        }
-    }
+    let proxy = |&group: &u32| {
+        let rows = groups.members(group as usize);
+        let weights = weights(rows, importance, states);
+        let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
+        merge_member_states(&members, states, groups.leaders()[group as usize], merge, Attributes::all())
+    };
+    let mut row = 0;
+    for_each_proxy(&clusters, proxy, |_, proxy| {
+        proxy.write(Attributes::all(), row, &mut out);
+        row += 1;
+    });
     out
 }
 
-fn position(states: &Gaussians, i: u32) -> DVec3 {
-    DVec3::from(states.position.row::<3>(i as usize).map(f64::from))
+/// Computes a proxy for each of `items` by `compute`, in parallel, and passes the items and their proxies to `write` in
+/// order. At most [`BATCH`] proxies are in memory.
+pub(super) fn for_each_proxy<T: Sync>(
+    items: &[T],
+    compute: impl Fn(&T) -> ProxyState + Sync,
+    mut write: impl FnMut(&T, &ProxyState),
+) {
+    for batch in items.chunks(BATCH) {
+        let proxies: Vec<ProxyState> = batch.par_iter().map(&compute).collect();
+        batch.iter().zip(&proxies).for_each(|(item, proxy)| write(item, proxy));
+    }
 }
 
 fn scales(states: &Gaussians, i: u32) -> DVec3 {
-    DVec3::from(states.log_scale.row::<3>(i as usize).map(|log_scale| f64::from(log_scale).exp()))
+    states.scales_f64(i as usize).into()
 }
 
 fn opacity(states: &Gaussians, i: u32) -> f64 {

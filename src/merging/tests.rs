@@ -112,7 +112,7 @@ impl MergeScene {
     /// Returns this scene rotated, scaled and shifted as a whole.
     fn transformed(mut self, rotation: DQuat, scale: f64, shift: DVec3) -> Self {
         for i in 0..self.states.len() {
-            let position = DVec3::from(self.states.position.row::<3>(i).map(f64::from));
+            let position = DVec3::from(self.states.position_f64(i));
             self.states.position.set_row(i, (rotation * position * scale + shift).to_array().map(|x| x as f32));
             let q = rotation * appearance::unit_rotation(self.states.rotation.row(i));
             self.states.rotation.set_row(i, [q.w, q.x, q.y, q.z].map(|x| x as f32));
@@ -130,7 +130,7 @@ fn joins(merged: &MergeResult) -> usize {
 
 /// Returns the index of the group that contains the Gaussian `row`.
 fn group_of(groups: &MergeGroups, row: u32) -> usize {
-    (0..groups.len()).find(|&group| groups.members(group).contains(&row)).unwrap()
+    (0..groups.group_count()).find(|&group| groups.members(group).contains(&row)).unwrap()
 }
 
 #[test]
@@ -157,7 +157,7 @@ fn static_neighbors_merge_diverging_ones_do_not() {
     let scene = MergeScene::uniform_cube(2000);
     let still = scene.merge(&scene.recipe(), None);
     assert!(joins(&still) > 300, "{:?}", still.passes);
-    assert_eq!(still.groups.len(), 2000 - joins(&still));
+    assert_eq!(still.groups.group_count(), 2000 - joins(&still));
     assert_eq!(still.proxies.len(), still.groups.clusters().count());
     // Every second Gaussian moves up, the others down.
     let mut later = scene.states.position.clone();
@@ -166,7 +166,7 @@ fn static_neighbors_merge_diverging_ones_do_not() {
     }
     let flying = scene.merge_moving(&scene.recipe(), None, &[scene.states.position.clone(), later]);
     assert!(joins(&flying) > 100);
-    for group in 0..flying.groups.len() {
+    for group in 0..flying.groups.group_count() {
         let parity: Vec<u32> = flying.groups.members(group).iter().map(|row| row % 2).collect();
         assert!(parity.windows(2).all(|w| w[0] == w[1]), "group {group} flies both ways");
     }
@@ -205,7 +205,7 @@ fn exact_duplicates_merge_to_one() {
     let mut recipe = scene.recipe();
     recipe.passes[0].epsilon = 0.0;
     let merged = scene.merge(&recipe, None);
-    assert_eq!(merged.groups.len(), 20);
+    assert_eq!(merged.groups.group_count(), 20);
     for group in 0..20 {
         let members = merged.groups.members(group);
         assert_eq!(members.iter().map(|row| row % 20).collect::<Vec<_>>(), [members[0] % 20; 3]);
@@ -233,9 +233,9 @@ fn coincident_gaussians_merge_before_their_neighbors() {
         recipe.passes[0].epsilon = 0.01;
         let merged = scene.merge(&recipe, None);
         let members = |row| merged.groups.members(group_of(&merged.groups, row)).len();
-        assert_eq!((merged.groups.len(), members(1), members(2)), (2, count + 1, count), "{:?}", merged.passes);
+        assert_eq!((merged.groups.group_count(), members(1), members(2)), (2, count + 1, count), "{:?}", merged.passes);
         let limited = scene.merge(&recipe, Some(count));
-        assert_eq!(limited.groups.len(), count + 1);
+        assert_eq!(limited.groups.group_count(), count + 1);
         let (rows, frame) = ((0..=2 * count as u32).collect::<Vec<u32>>(), [scene.states.position.clone()]);
         let (batches, _) = scene.merge_in_batches(&rows, &recipe, None, &frame, 7);
         assert!(batches.groups == merged.groups && batches.proxies == merged.proxies);
@@ -310,7 +310,7 @@ fn the_limit_counts_joins_over_all_passes_exactly() {
     assert!(both > first, "the second pass joins nothing: {:?}", all.passes);
     for limit in [0, 1, first, first + 1, both, both + 5] {
         let merged = scene.merge(&recipe, Some(limit));
-        assert_eq!(merged.groups.len(), 2000 - limit.min(both), "limit {limit}");
+        assert_eq!(merged.groups.group_count(), 2000 - limit.min(both), "limit {limit}");
     }
 }
 
@@ -329,7 +329,7 @@ fn no_survivors_and_one_survivor_pass_through() {
     for n in [0, 1] {
         let scene = MergeScene::uniform_cube(n);
         let merged = scene.merge(&Recipe::preset("default").unwrap().merge, None);
-        assert_eq!((merged.groups.len(), merged.proxies.len()), (n, 0));
+        assert_eq!((merged.groups.group_count(), merged.proxies.len()), (n, 0));
     }
 }
 
@@ -350,7 +350,7 @@ fn unselected_rows_have_no_effect() {
     let expected = part.merge(&recipe, None);
     assert!(joins(&got) > 100 && got.proxies == expected.proxies);
     let named = |groups: &MergeGroups, id: &dyn Fn(u32) -> u32| -> Vec<Vec<u32>> {
-        (0..groups.len()).map(|g| groups.members(g).iter().map(|&row| id(row)).collect()).collect()
+        (0..groups.group_count()).map(|g| groups.members(g).iter().map(|&row| id(row)).collect()).collect()
     };
     assert_eq!(named(&got.groups, &|row| row), named(&expected.groups, &|row| rows[row as usize]));
 }

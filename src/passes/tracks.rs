@@ -67,7 +67,7 @@ mod tests {
         for frame in 0..7 {
             let state = gather_all(&scene, frame, Attributes::all()).unwrap();
             for (row, (a, b)) in one.iter().zip(&three).enumerate() {
-                assert_eq!(a.position[frame], state.position.row::<3>(row).map(f64::from));
+                assert_eq!(a.position[frame], state.position_f64(row));
                 assert_eq!(a.opacity[frame], opacity(state.opacity_logit.row::<1>(row)[0]));
                 assert_eq!(a.sh(frame)[2], state.sh.plane(2)[row]);
                 assert_eq!((&a.rotation, &a.position), (&b.rotation, &b.position));

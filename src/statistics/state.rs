@@ -102,7 +102,7 @@ impl BlockState {
             return;
         }
         for i in chunk {
-            let mut quaternion = gaussians.rotation.row::<4>(i).map(f64::from);
+            let mut quaternion = gaussians.rotation_f64(i);
             if quaternion == [0.0; 4] {
                 quaternion = [1.0, 0.0, 0.0, 0.0];
             }

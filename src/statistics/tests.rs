@@ -480,9 +480,9 @@ fn slice(from: &Gaussians, range: std::ops::Range<usize>) -> Gaussians {
 fn moved(from: &Gaussians, turn: DQuat, offset: DVec3) -> Gaussians {
     let mut out = from.clone();
     for i in 0..from.len() {
-        let x = turn * DVec3::from_array(from.position.row(i).map(f64::from)) + offset;
+        let x = turn * DVec3::from_array(from.position_f64(i)) + offset;
         out.position.set_row(i, x.to_array().map(|x| x as f32));
-        let [w, x, y, z] = from.rotation.row(i).map(f64::from);
+        let [w, x, y, z] = from.rotation_f64(i);
         let q = turn * DQuat::from_xyzw(x, y, z, w);
         out.rotation.set_row(i, [q.w, q.x, q.y, q.z].map(|x| x as f32));
     }

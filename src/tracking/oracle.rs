@@ -44,7 +44,7 @@ pub(super) struct SeenGaussian {
 /// Returns the position and appearance of Gaussian `i` of a frame.
 pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     let [w, x, y, z] = {
-        let q = state.rotation.row::<4>(i).map(f64::from);
+        let q = state.rotation_f64(i);
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
         q.map(|x| x / length)
     };
@@ -56,7 +56,7 @@ pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     let columns = (covariance * trace.recip()).to_cols_array_2d();
     let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<u32>>();
     SeenGaussian {
-        position: state.position.row::<3>(i).map(f64::from),
+        position: state.position_f64(i),
         size: rms_size(state, i),
         shape: columns,
         opacity: opacity(state.opacity_logit.plane(0)[i]),

@@ -106,7 +106,7 @@ fn assert_near(found: &Gaussians, expected: &Gaussians, steps: &Steps, what: &st
 
 /// Returns the rotation of Gaussian `i` as a unit quaternion.
 fn quaternion(gaussians: &Gaussians, i: usize) -> DQuat {
-    let [w, x, y, z] = gaussians.rotation.row::<4>(i).map(f64::from);
+    let [w, x, y, z] = gaussians.rotation_f64(i);
     DQuat::from_xyzw(x, y, z, w).normalize()
 }
 
@@ -264,11 +264,11 @@ fn three_js_reads_our_files() {
         let (positions, covariances, colors) = (values("positions"), values("covariances"), values("colors"));
         assert_eq!(positions.len(), 3 * COUNT, "{name}");
         for i in 0..COUNT {
-            let expected = DVec3::from_array(original.position.row::<3>(i).map(f64::from)) * axes;
+            let expected = DVec3::from_array(original.position_f64(i)) * axes;
             let place = DVec3::from_slice(&positions[3 * i..]);
             assert!((place - expected).abs().max_element() < 1e-4, "{name}, {i}: {place}, expected {expected}");
             let turn = DMat3::from_diagonal(axes) * DMat3::from_quat(quaternion(&original, i));
-            let scale = DVec3::from_array(original.log_scale.row::<3>(i).map(|log| f64::from(log).exp()));
+            let scale = DVec3::from_array(original.scales_f64(i));
             let half = turn * DMat3::from_diagonal(scale);
             let covariance = half * half.transpose();
             let largest = covariance.col(0).x.max(covariance.col(1).y).max(covariance.col(2).z);

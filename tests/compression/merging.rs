@@ -50,18 +50,18 @@ impl AllFrames {
     }
 
     fn at(&self, frame: usize, i: usize) -> DVec3 {
-        DVec3::from(self.frames[frame].position.row::<3>(i).map(f64::from))
+        DVec3::from(self.frames[frame].position_f64(i))
     }
 }
 
 fn rotation(state: &Gaussians, i: usize) -> DQuat {
-    let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);
+    let [w, x, y, z] = state.rotation_f64(i);
     DQuat::from_xyzw(x, y, z, w).normalize()
 }
 
 fn covariance(state: &Gaussians, i: usize) -> DMat3 {
     let axes = DMat3::from_quat(rotation(state, i));
-    let scale = DVec3::from(state.log_scale.row::<3>(i).map(|x| f64::from(x).exp()));
+    let scale = DVec3::from(state.scales_f64(i));
     axes * DMat3::from_diagonal(scale * scale) * axes.transpose()
 }
 
@@ -71,7 +71,7 @@ fn passes_tests_1_and_2(state: &Gaussians, i: usize, j: usize, merge: &MergePara
     let sigma = (covariance(state, i) + covariance(state, j)) * 0.5;
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
     let regular = sigma + DMat3::from_diagonal(DVec3::splat(1e-6 * trace));
-    let position = |i: usize| DVec3::from(state.position.row::<3>(i).map(f64::from));
+    let position = |i: usize| DVec3::from(state.position_f64(i));
     let delta = position(i) - position(j);
     let mahalanobis = delta.dot(regular.inverse() * delta).sqrt();
 
@@ -154,7 +154,7 @@ fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Re
         let hash = |node: usize| splatsieve::model::hash_id(groups[node][0] as u64);
         let mut order: Vec<usize> = (0..groups.len()).collect();
         order.sort_by(|&a, &b| size(b).partial_cmp(&size(a)).unwrap().then(hash(a).cmp(&hash(b))));
-        let position = |node: usize| DVec3::from(nodes.position.row::<3>(node).map(f64::from));
+        let position = |node: usize| DVec3::from(nodes.position_f64(node));
         let mut leader: Vec<Option<usize>> = vec![None; groups.len()];
         for &node in &order {
             if leader[node].is_some() {
@@ -237,7 +237,7 @@ fn assert_is_mixture(
     leader: usize,
     merge: &MergeParams,
 ) {
-    let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
+    let position = |i: usize| DVec3::from(states.position_f64(i));
     let mean = match merge.placement {
         ProxyPosition::Leader => position(leader),
         ProxyPosition::Mean => members.iter().map(|&(i, weight)| weight * position(i as usize)).sum(),
@@ -264,7 +264,7 @@ fn assert_is_mixture(
         4.0 * std::f64::consts::PI * (sections.iter().sum::<f64>() / 3.0).powf(1.0 / 1.6075)
     };
     let opacity_and_area = |i: u32| {
-        let scale = DVec3::from(states.log_scale.row::<3>(i as usize).map(|x| f64::from(x).exp()));
+        let scale = DVec3::from(states.scales_f64(i as usize));
         (1.0 / (1.0 + (-f64::from(states.opacity_logit.plane(0)[i as usize])).exp()), surface(scale))
     };
     let opacity = match merge.opacity {
@@ -525,7 +525,7 @@ fn proxies_that_drift_from_members_return_to_leaders() {
         at_means += 1;
         for (t, frame) in frames.iter().enumerate() {
             let mean: DVec3 = members.iter().map(|&(id, weight)| weight * all_frames.at(t, id as usize)).sum();
-            let off = (DVec3::from(frame.position.row::<3>(place).map(f64::from)) - mean).length();
+            let off = (DVec3::from(frame.position_f64(place)) - mean).length();
             assert!(off <= limit * 1.001, "proxy {place} is {off} off at frame {t}, at most {limit} expected");
         }
     }

@@ -62,7 +62,7 @@ impl StateErrors {
         let (opacity, color) = (expected("opacity", 1), expected(COLOR_KEY, 3));
         let raise = |most: &mut f64, found: f64, wanted: f64| *most = most.max((found - wanted).abs());
         for i in 0..state.len() {
-            let q = state.rotation.row::<4>(i).map(f64::from);
+            let q = state.rotation_f64(i);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             for c in 0..4 {
                 raise(&mut self.rotation, q[c] / length, rotation[4 * i + c]);
@@ -122,9 +122,9 @@ fn covariance_errors(scene: &Scene, model: &Path) -> [f64; 3] {
         let count = state.len();
         for i in 0..count {
             let at = row * count + i;
-            let q = state.rotation.row::<4>(i).map(f64::from);
+            let q = state.rotation_f64(i);
             let turn = glam::DMat3::from_quat(glam::DQuat::from_xyzw(q[1], q[2], q[3], q[0]).normalize());
-            let scales = glam::DVec3::from(state.log_scale.row::<3>(i).map(|x| f64::from(x).exp()));
+            let scales = glam::DVec3::from(state.scales_f64(i));
             let axes = turn * glam::DMat3::from_diagonal(scales);
             let found = (axes * axes.transpose()).to_cols_array();
             let cov = &expected["cov"][6 * at..][..6];
@@ -360,10 +360,10 @@ fn native_4d_gaussians_states_match_their_trainer() {
 
 /// Returns the covariance R diag(s)² Rᵀ of Gaussian `i` as xx, xy, xz, yy, yz, zz.
 fn covariance(state: &Gaussians, i: usize) -> [f64; 6] {
-    let q = state.rotation.row::<4>(i).map(f64::from);
+    let q = state.rotation_f64(i);
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     let [w, x, y, z] = q.map(|x| x / length);
-    let s = state.log_scale.row::<3>(i).map(|x| f64::from(x).exp());
+    let s = state.scales_f64(i);
     let rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
         [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],

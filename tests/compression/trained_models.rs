@@ -50,7 +50,7 @@ fn frames_agree(model: &Path) {
         let values = |name: &str, width: usize| &expected[name][row * n * width..(row + 1) * n * width];
         for i in 0..n {
             let at = |what| At { model, what, i, frame };
-            let q = state.rotation.row::<4>(i).map(f64::from);
+            let q = state.rotation_f64(i);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             for c in 0..3 {
                 let position = f64::from(state.position.plane(c)[i]);

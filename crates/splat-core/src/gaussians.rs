@@ -136,6 +136,21 @@ impl Gaussians {
         self.len() == 0
     }
 
+    /// Returns the position of Gaussian `i` in f64.
+    pub fn position_f64(&self, i: usize) -> [f64; 3] {
+        self.position.row(i).map(f64::from)
+    }
+
+    /// Returns the quaternion (w, x, y, z) of Gaussian `i` in f64, as stored.
+    pub fn rotation_f64(&self, i: usize) -> [f64; 4] {
+        self.rotation.row(i).map(f64::from)
+    }
+
+    /// Returns the scales (not their logarithms) of Gaussian `i` in f64.
+    pub fn scales_f64(&self, i: usize) -> [f64; 3] {
+        self.log_scale.row(i).map(|log| f64::from(log).exp())
+    }
+
     /// Returns the degree of the SH coefficients.
     pub fn sh_degree(&self) -> usize {
         (self.sh.width() / 3).isqrt().saturating_sub(1)

@@ -463,7 +463,7 @@ mod tests {
         let moved = |a: usize, b: usize| {
             let [a, b] = [a, b].map(|frame| state(&scene, frame));
             let far = (0..2000).map(|i| {
-                let [a, b] = [&a, &b].map(|state| DVec3::from_array(state.position.row::<3>(i).map(f64::from)));
+                let [a, b] = [&a, &b].map(|state| DVec3::from_array(state.position_f64(i)));
                 (a - b).length()
             });
             far.fold(0.0, f64::max)

@@ -108,7 +108,7 @@ fn egg_moves_as_one_body() {
     let film = film(&usual(), DemoBody::Egg);
     let n = film[0].len();
     let quaternion = |state: &Gaussians, i: usize| {
-        let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);
+        let [w, x, y, z] = state.rotation_f64(i);
         glam::DQuat::from_xyzw(x, y, z, w)
     };
     for state in &film[1..] {
@@ -147,7 +147,7 @@ fn cloth_is_held_at_one_edge_and_bends_at_the_other() {
     // distance of 0.05.
     let state = &film[5];
     let normal = |i: usize| {
-        let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);
+        let [w, x, y, z] = state.rotation_f64(i);
         glam::DQuat::from_xyzw(x, y, z, w) * DVec3::Z
     };
     for (i, j) in (0..n).flat_map(|i| (0..i).map(move |j| (i, j))) {

@@ -113,7 +113,7 @@ pub(super) fn duplicates() -> CaseResult {
             let merged =
                 run(&survivors, &recipe(rule)?, None, 1000, |asked| Ok::<_, Error>(vec![1.0; asked.pairs().len()]))?;
             let groups = &merged.groups;
-            let members: Vec<&[u32]> = (0..groups.len()).map(|group| groups.members(group)).collect();
+            let members: Vec<&[u32]> = (0..groups.group_count()).map(|group| groups.members(group)).collect();
             let mut sorted = members;
             sorted.sort_unstable();
             worst.same(&sorted[..], &[&rows[..8], &rows[8..]]);
@@ -136,10 +136,10 @@ fn recipe(opacity: ProxyOpacity) -> Result<MergeParams> {
 
 /// Returns Gaussian `i` of `states` as a component of a mixture, with the weight `weight`.
 fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
-    let [w, x, y, z] = states.rotation.row::<4>(i).map(f64::from);
+    let [w, x, y, z] = states.rotation_f64(i);
     WeightedGaussian {
         weight,
-        position: DVec3::from(states.position.row::<3>(i).map(f64::from)),
+        position: DVec3::from(states.position_f64(i)),
         rotation: DQuat::from_xyzw(x, y, z, w).normalize(),
         scales: DVec3::from(states.log_scale.row::<3>(i).map(f64::from)).exp(),
     }

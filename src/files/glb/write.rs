@@ -106,7 +106,7 @@ pub fn write_glb(state: &Gaussians, path: &Path) -> Result<()> {
 fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
     let of_extension = |name: &str| format!("{EXTENSION}:{name}");
     let rotation = move |row| {
-        let q = state.rotation.row::<4>(row).map(f64::from);
+        let q = state.rotation_f64(row);
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
         let [w, x, y, z] = if length > 0.0 { q.map(|x| (x / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
         [-x, -y, z, w]

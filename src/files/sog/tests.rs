@@ -59,7 +59,7 @@ fn assert_near(found: &Gaussians, state: &Gaussians) {
         assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1.0 / 255.0), "color {i}: {a:?}, expected {b:?}");
         let [a, b] = [found, state].map(|state| opacity(state.opacity_logit.row::<1>(i)[0]));
         assert!((a - b).abs() <= 0.5 / 255.0 + 1e-7, "opacity {i}: {a}, expected {b}");
-        let [a, b] = [found, state].map(|state| state.rotation.row::<4>(i).map(f64::from));
+        let [a, b] = [found, state].map(|state| state.rotation_f64(i));
         let length = b.iter().map(|x| x * x).sum::<f64>().sqrt();
         let dot: f64 = a.iter().zip(b).map(|(a, b)| a * b / length).sum();
         assert!(dot.abs() > 0.9999, "rotation {i}: {a:?}, expected {b:?}");

@@ -89,12 +89,12 @@ pub(in crate::models) fn check_round_trip(
 /// divided by its largest entry. Rotation and scales are compared through the covariance, because different rotations
 /// and scales may have almost the same covariance.
 fn values(state: &Gaussians, i: usize) -> Vec<f64> {
-    let [w, x, y, z] = state.rotation.row(i).map(f64::from);
+    let [w, x, y, z] = state.rotation_f64(i);
     let turn = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
-    let axes = turn * DMat3::from_diagonal(DVec3::from(state.log_scale.row(i).map(|scale| f64::from(scale).exp())));
+    let axes = turn * DMat3::from_diagonal(DVec3::from(state.scales_f64(i)));
     let covariance = (axes * axes.transpose()).to_cols_array();
     let largest = covariance.iter().fold(0.0, |largest: f64, entry| largest.max(entry.abs()));
-    let mut values: Vec<f64> = state.position.row::<3>(i).map(f64::from).to_vec();
+    let mut values: Vec<f64> = state.position_f64(i).to_vec();
     values.push(opacity(state.opacity_logit.plane(0)[i]));
     values.extend((0..state.sh.width()).map(|c| f64::from(state.sh.plane(c)[i])));
     values.extend(covariance.map(|entry| entry / largest));

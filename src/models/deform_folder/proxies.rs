@@ -106,7 +106,7 @@ pub(super) fn propose<L: NetworkMotionModel>(
 
 /// Returns the position of the Gaussian in row `row` of `state`.
 fn position(state: &Gaussians, row: usize) -> DVec3 {
-    DVec3::from(state.position.row::<3>(row).map(f64::from))
+    DVec3::from(state.position_f64(row))
 }
 
 /// Returns for each Gaussian of `raw` (stored parameters) the sum over `frames` of the squared distance between the
@@ -238,7 +238,7 @@ impl StateDifference {
             self.scale[c] += to[c].exp() - from[c].exp();
             self.off += (to[c] - from[c]).powi(2);
         }
-        let [to, from] = [target, state].map(|state| state.rotation.row::<4>(row).map(f64::from));
+        let [to, from] = [target, state].map(|state| state.rotation_f64(row));
         let [wide, long] = [to, from].map(|q| q.iter().map(|x| x * x).sum::<f64>().sqrt());
         let sign = 1f64.copysign((0..4).map(|c| to[c] * from[c]).sum());
         for c in 0..4 {
@@ -253,10 +253,10 @@ impl StateDifference {
     /// Adds the mean difference per frame to the stored parameters of the proxy (Gaussian that replaces a merged
     /// cluster) in row `row` of `to`. `share` is 1 divided by the number of added frames.
     fn apply<L: NetworkMotionModel>(&self, share: f64, to: &mut Gaussians, row: usize) {
-        let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
+        let scale = to.scales_f64(row);
         let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(MIN_SCALE).ln() as f32);
         to.log_scale.set_row(row, scale);
-        let own = to.rotation.row::<4>(row).map(f64::from);
+        let own = to.rotation_f64(row);
         // If stored quaternions are normalized first, the correction is multiplied by their length.
         let long = if L::NORMALIZES_ROTATION { own.iter().map(|x| x * x).sum::<f64>().sqrt() } else { 1.0 };
         let rotation = [0, 1, 2, 3].map(|c| (own[c] + long * share * self.rotation[c]) as f32);

@@ -174,8 +174,8 @@ fn unit(q: [f64; 4]) -> [f64; 4] {
 }
 
 fn state_covariance(state: &Gaussians, i: usize) -> DMat3 {
-    let scales = state.log_scale.row::<3>(i).map(|x| f64::from(x).exp());
-    covariance(scales, unit(state.rotation.row::<4>(i).map(f64::from)))
+    let scales = state.scales_f64(i);
+    covariance(scales, unit(state.rotation_f64(i)))
 }
 
 fn relative_difference(a: DMat3, b: DMat3) -> f64 {

@@ -119,8 +119,8 @@ impl MotionModel for DeformableMotion {
         }
         if !(want & SHAPE).is_empty() {
             for row in 0..raw.len() {
-                let scales = raw_state.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
-                let rotation = raw_state.rotation.row::<4>(row).map(f64::from);
+                let scales = raw_state.scales_f64(row);
+                let rotation = raw_state.rotation_f64(row);
                 let by = (motion.scaling.row::<3>(row), motion.rotation.row::<4>(row));
                 let (scales, rotation) = scale_rotation(covariance(scales, rotation, by), rotation);
                 if want.contains(Attributes::LOG_SCALE) {

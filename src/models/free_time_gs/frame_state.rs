@@ -156,7 +156,7 @@ impl ProxyRule for FreeTime {
         let line = |id: u32| {
             let id = id as usize;
             LinearPath {
-                position: raw.gaussians.position.row::<3>(id).map(f64::from),
+                position: raw.gaussians.position_f64(id),
                 velocity: [0, 1, 2].map(|c| f64::from(raw.format_specific.plane(VELOCITY + c)[id]) / span),
                 center: first + span * f64::from(raw.format_specific.plane(TIME_CENTER)[id]),
                 deviation: span * motion.deviation(raw.format_specific.plane(LOG_TIME_DEVIATION)[id]),
@@ -181,7 +181,7 @@ impl ProxyRule for FreeTime {
             own.plane_mut(LOG_TIME_DEVIATION)[row] = (line.deviation / span - floor[1]).max(floor[0]).ln() as f32;
             (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[row] = (span * line.velocity[c]) as f32);
             let Some((opacity, covariance)) = matched.shape else { continue };
-            let like = gaussians.rotation.row::<4>(row).map(f64::from);
+            let like = gaussians.rotation_f64(row);
             let (scales, rotation) = scale_rotation(covariance, like);
             gaussians.log_scale.set_row(row, scales.map(|scale| scale.ln() as f32));
             gaussians.rotation.set_row(row, rotation.map(|q| q as f32));

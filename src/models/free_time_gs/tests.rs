@@ -127,7 +127,7 @@ fn states_follow_the_formulas() {
             let expected = ((-0.5 * (dt / s).powi(2)).exp() / (1.0 + (-values(3, row)[0]).exp())).max(1e-4);
             let got = opacity(state.opacity_logit.plane(0)[row]);
             assert!((got - expected).abs() < 1e-7, "{got} {expected}");
-            assert_eq!(state.rotation.row::<4>(row).map(f64::from).to_vec(), values(2, row));
+            assert_eq!(state.rotation_f64(row).to_vec(), values(2, row));
             assert_eq!(state.log_scale.row::<3>(row).map(f64::from).to_vec(), values(1, row));
             assert_eq!(state.sh.row::<48>(row).map(f64::from).to_vec(), [values(4, row), values(5, row)].concat());
         }

@@ -166,8 +166,8 @@ impl FrameSums {
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
-        let scales = state.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
-        let values = covariance(scales, state.rotation.row::<4>(row).map(f64::from));
+        let scales = state.scales_f64(row);
+        let values = covariance(scales, state.rotation_f64(row));
         self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 

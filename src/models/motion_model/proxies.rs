@@ -49,7 +49,7 @@ pub(in crate::models) fn propose_proxies<L: MotionModel>(
             if a.max(b) < MIN_VISIBLE_OPACITY {
                 continue;
             }
-            let [to, from] = [&wanted, &made].map(|state| state.position.row::<3>(proxy).map(f64::from));
+            let [to, from] = [&wanted, &made].map(|state| state.position_f64(proxy));
             let distance = to.iter().zip(from).map(|(to, from)| (to - from).powi(2)).sum::<f64>().sqrt();
             // The comparison is false for values that are not finite.
             drifts[proxy] |= !(distance <= drift && (a - b).abs() <= MAX_OPACITY_DIFFERENCE);

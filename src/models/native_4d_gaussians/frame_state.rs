@@ -140,7 +140,7 @@ impl MotionModel for Native {
             (0..3).for_each(|c| slices.velocity[c][i] = velocity[c]);
             slices.rates[i] = self.rate(variance);
             if let Some(covariance) = covariance {
-                let (scales, rotation) = scale_rotation(covariance, raw.gaussians.rotation.row(i).map(f64::from));
+                let (scales, rotation) = scale_rotation(covariance, raw.gaussians.rotation_f64(i));
                 slices.rotation.set_row(i, rotation.map(|q| q as f32));
                 slices.log_scale.set_row(i, scales.map(|scale| scale.ln() as f32));
             }

@@ -37,7 +37,7 @@ pub(super) fn propose(
     let line = |id: u32| {
         let slice = motion_model.slice(raw, id as usize);
         LinearPath {
-            position: raw.gaussians.position.row::<3>(id as usize).map(f64::from),
+            position: raw.gaussians.position_f64(id as usize),
             velocity: slice.velocity,
             center: raw.format_specific.plane(TIME)[id as usize].into(),
             deviation: slice.variance.sqrt(),
@@ -75,7 +75,7 @@ pub(super) fn propose(
             own.plane_mut(SCALING_T)[row] = along;
             (0..4).for_each(|c| own.plane_mut(ROTATION_R + c)[row] = r[c] as f32);
         } else {
-            let (scales, rotation) = scale_rotation(covariance, gaussians.rotation.row::<4>(row).map(f64::from));
+            let (scales, rotation) = scale_rotation(covariance, gaussians.rotation_f64(row));
             gaussians.log_scale.set_row(row, scales.map(|scale| scale.ln() as f32));
             gaussians.rotation.set_row(row, rotation.map(|q| q as f32));
             own.plane_mut(SCALING_T)[row] = variance.ln() as f32;

@@ -169,10 +169,7 @@ fn check(parameters: &[(usize, PickledTensor)], flipped: bool, row: usize, time:
         let got = f64::from(state.position.plane(c)[row]);
         assert!((got - expected).abs() < 1e-6, "position {c}: {got} {expected}");
     }
-    let got = covariance(
-        state.log_scale.row::<3>(row).map(|x| f64::from(x).exp()),
-        state.rotation.row::<4>(row).map(f64::from),
-    );
+    let got = covariance(state.scales_f64(row), state.rotation_f64(row));
     let expected =
         [slice.col(0)[0], slice.col(1)[0], slice.col(2)[0], slice.col(1)[1], slice.col(2)[1], slice.col(2)[2]];
     let most = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
@@ -216,7 +213,7 @@ fn without_4d_rotation_space_and_time_are_independent() {
     let values = |i: usize, row: usize| floats(&parts.iter().find(|part| part.0 == i).unwrap().1, row);
     for (state, time) in states(&*model).iter().zip(TIMES) {
         for row in 0..COUNT {
-            assert_eq!(state.position.row::<3>(row).map(f64::from).to_vec(), values(1, row));
+            assert_eq!(state.position_f64(row).to_vec(), values(1, row));
             assert_eq!(state.log_scale.row::<3>(row).map(f64::from).to_vec(), values(4, row));
             let m = (-0.5 * (time - values(13, row)[0]).powi(2) / values(14, row)[0].exp()).exp();
             let expected = if m > 0.05 { m / (1.0 + (-values(6, row)[0]).exp()) } else { 0.0 };

@@ -39,8 +39,8 @@ impl SpacetimeMotion {
         SpacetimeMotion {
             center: own(CENTER),
             log_width: own(LOG_WIDTH),
-            path: [raw.gaussians.position.row::<3>(row).map(f64::from), path(0), path(1), path(2)],
-            rotation: raw.gaussians.rotation.row::<4>(row).map(f64::from),
+            path: [raw.gaussians.position_f64(row), path(0), path(1), path(2)],
+            rotation: raw.gaussians.rotation_f64(row),
             omega: std::array::from_fn(|c| own(OMEGA + c)),
         }
     }

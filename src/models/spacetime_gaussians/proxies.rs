@@ -199,13 +199,13 @@ fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], moti
         let open = motion.window(time);
         for &(row, weight) in &members.rows {
             let at = row as usize;
-            let position = DVec3::from(state.position.row::<3>(at).map(f64::from));
-            let own = quaternion(state.rotation.row::<4>(at).map(f64::from));
+            let position = DVec3::from(state.position_f64(at));
+            let own = quaternion(state.rotation_f64(at));
             parts.push(WeightedGaussian {
                 weight: weight * open,
                 position: axes.inverse() * (position - middle),
                 rotation: (axes.inverse() * own).normalize(),
-                scales: DVec3::from(state.log_scale.row::<3>(at).map(|log| f64::from(log).exp())),
+                scales: DVec3::from(state.scales_f64(at)),
             });
         }
     }

@@ -311,7 +311,7 @@ fn proxy_of_similar_members_is_their_mean_at_every_frame() {
             assert!((found.log_scale.plane(c)[1] - all.log_scale.plane(c)[2]).abs() < 1e-5);
         }
         let unit = |state: &Gaussians, i: usize| {
-            let q = state.rotation.row::<4>(i).map(f64::from);
+            let q = state.rotation_f64(i);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             q.map(|x| x / length)
         };

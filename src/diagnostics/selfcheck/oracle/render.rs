@@ -72,17 +72,17 @@ fn view_depth([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
 }
 
 fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footprint> {
-    let world = DVec3::from_array(gaussians.position.row::<3>(id).map(f64::from));
+    let world = DVec3::from_array(gaussians.position_f64(id));
     let p = camera.rotation * world + camera.translation;
     if p.z <= f64::from(camera.near as f32) {
         return None;
     }
-    let [w, x, y, z] = gaussians.rotation.row::<4>(id).map(f64::from);
+    let [w, x, y, z] = gaussians.rotation_f64(id);
     let axes = match DQuat::from_xyzw(x, y, z, w) {
         zero if zero.length() == 0.0 => DMat3::IDENTITY,
         q => DMat3::from_quat(q.normalize()),
     };
-    let scale = DMat3::from_diagonal(DVec3::from_array(gaussians.log_scale.row::<3>(id).map(|s| f64::from(s).exp())));
+    let scale = DMat3::from_diagonal(DVec3::from_array(gaussians.scales_f64(id)));
     let covariance = axes * scale * scale * axes.transpose();
     let (width, height) = (f64::from(camera.width), f64::from(camera.height));
     let limit = |slope: f64, half_field: f64| slope.max(-1.3 * half_field).min(1.3 * half_field);

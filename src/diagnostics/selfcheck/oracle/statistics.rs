@@ -25,7 +25,7 @@ pub(crate) struct OracleRow {
 /// of each frame.
 pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> OracleRow {
     let last = frames.len() - 1;
-    let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
+    let x = |t: usize| frames[t].position_f64(i);
     let alpha: Vec<f64> =
         frames.iter().map(|frame| 1.0 / (1.0 + (-f64::from(frame.opacity_logit.plane(0)[i])).exp())).collect();
     let alive = |t: usize| alpha[t] >= scan.alpha_min;
@@ -66,15 +66,15 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan:
 /// covariance. Returns 0 if the Gaussian is not beyond the near plane.
 pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
-    let world = frame.position.row::<3>(i).map(f64::from);
+    let world = frame.position_f64(i);
     let p: [f64; 3] = std::array::from_fn(|r| (0..3).map(|k| w[r][k] * world[k]).sum::<f64>() + camera.translation[r]);
     if p[2] <= camera.near {
         return 0.0;
     }
-    let q = frame.rotation.row::<4>(i).map(f64::from);
+    let q = frame.rotation_f64(i);
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     let q = if length == 0.0 { [1.0, 0.0, 0.0, 0.0] } else { q.map(|x| x / length) };
-    let s = frame.log_scale.row::<3>(i).map(|log| f64::from(log).exp());
+    let s = frame.scales_f64(i);
     // Column k of the rotation matrix R is the k-th unit vector, rotated by the quaternion q.
     let axes: [[f64; 3]; 3] = std::array::from_fn(|k| rotated_unit_vector(q, k));
     let sigma: [[f64; 3]; 3] =

@@ -98,7 +98,7 @@ fn states_agree(name: &str) {
                 worst[1] = worst[1].max((got - expected).abs() / expected);
                 close(&at("scale"), got, expected, 1e-5 * expected);
             }
-            let q = state.rotation.row::<4>(i).map(f64::from);
+            let q = state.rotation_f64(i);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             for c in 0..4 {
                 let expected = arrays["rotation"][4 * row + c];
