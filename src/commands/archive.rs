@@ -10,7 +10,7 @@ use crate::archive::MAGIC;
 use crate::commands::convert_report::ConvertReport;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, StagedFile, StagedFolder, TargetKind, check_target, write_summary};
 use crate::files::names::name_of;
 use crate::files::open::open_file;
 use crate::journal::Journal;
@@ -103,9 +103,7 @@ pub fn unpack_archive(
     let staged = StagedFolder::new(output, overwrite)?;
     unpack(&content, path, staged.path())?;
     let bytes = bytes_below(staged.path())?;
-    let marker = staged.path().join(SUMMARY_FILE);
-    let text = serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } });
-    fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
+    write_summary(staged.path(), &serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } }))?;
     staged.commit()?;
     Ok(Some(converted(OutputKind::Model, bytes)))
 }

@@ -3,15 +3,14 @@
 //! Containers are written by [`container::pack`](super::container::pack); archives are unpacked by
 //! [`unpack_archive`].
 
-use std::fs;
 use std::path::Path;
 
 use crate::TOOL;
 use crate::commands::archive::{check_frame_is_asked_of_frames, is_archive, unpack_archive, write_archive};
 use crate::commands::convert_report::ConvertReport;
 use crate::compressed_model::CompressedModel;
-use crate::error::{Error, Result};
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
+use crate::error::Result;
+use crate::files::atomic::{Replace, StagedFile, StagedFolder, TargetKind, check_target, write_summary};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::Attributes;
@@ -95,12 +94,11 @@ pub fn convert(
     let size = if kind.is_folder() {
         let staged = StagedFolder::new(output, overwrite)?;
         let size = write(staged.path())?;
-        let marker = serde_json::json!({
+        let summary = serde_json::json!({
             "tool": TOOL,
             "input": InputSummary::new(model, &input.path, model.digest()?)?.without_folder_paths(),
         });
-        let path = staged.path().join(SUMMARY_FILE);
-        fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
+        write_summary(staged.path(), &summary)?;
         staged.commit()?;
         size
     } else {

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::TOOL;
 use crate::cache::{Completion, Spill, SpillWriter};
 use crate::error::{Error, Result, ShowPath};
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, StagedFile, StagedFolder, TargetKind, check_target, write_summary};
 use crate::files::image::write::{ImageFormat, image_bytes, write_image};
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
@@ -136,7 +136,7 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
             job.write(&chosen, |view| staged.path().join(name(view)))?;
             staged
         };
-        let marker = serde_json::json!({
+        let summary = serde_json::json!({
             "tool": TOOL,
             "input": InputSummary::new(&*scene.input, &scene.path, scene.digest()?)?.without_folder_paths(),
             "cameras": CameraSummary {
@@ -146,8 +146,7 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
             },
             "background": background,
         });
-        let path = staged.path().join(SUMMARY_FILE);
-        fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
+        write_summary(staged.path(), &summary)?;
         staged.commit()?;
     }
     let notes = scene.notes.into_iter().chain(scene.work.take_notes()).collect();

@@ -11,7 +11,7 @@ use serde::Serialize;
 use crate::diagnostics::demo_scene::Playground;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::EvaluateOptions;
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, StagedFolder, TargetKind, check_target, write_summary};
 use crate::files::container::Container;
 use crate::limits::Limits;
 use crate::memory_plan::Budget;
@@ -178,9 +178,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
         output: folder.join(REPORT_FOLDER),
         overwrite: Replace::Never,
     })?;
-    let marker = folder.join(SUMMARY_FILE);
-    let summary = serde_json::json!({ "tool": crate::TOOL, "verdict": found.result.verdict });
-    fs::write(&marker, format!("{summary:#}\n")).map_err(Error::io("write", &marker))?;
+    write_summary(folder, &serde_json::json!({ "tool": crate::TOOL, "verdict": found.result.verdict }))?;
     Ok(DemoReport::new(&found))
 }
 

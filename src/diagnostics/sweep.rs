@@ -6,7 +6,6 @@
 //! that the measured time and memory are those of this run alone. The result is deleted once it has been measured.
 //! Memory: first the memory of `compress`, then the memory of `evaluate`.
 
-use std::fs;
 use std::path::PathBuf;
 
 use super::whole_run::{WholeRun, result_name, with_training_views};
@@ -15,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::evaluation::cost::RepeatLimits;
 use crate::evaluation::method::{Method, MethodKind, STEPS, refining_by};
 use crate::evaluation::trade_off::{EffortCurve, EffortSetting, TradeOff, TradeOffPoint};
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, StagedFolder, TargetKind, check_target, write_summary, write_text};
 use crate::files::names::name_of;
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::Target;
@@ -118,18 +117,14 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
             .notes
             .push(format!("{name}: merging alone leaves {merged_count} Gaussians, so it has no smaller points"));
     }
-    let write = |name: &str, text: String| {
-        let path = staged.path().join(name);
-        fs::write(&path, text).map_err(Error::io("write", &path))
-    };
+    let write = |name: &str, text: String| write_text(staged.path(), name, text);
     write("sweep.csv", trade_off.csv())?;
     if !trade_off.knobs.is_empty() {
         write("knobs.csv", trade_off.knobs_csv())?;
     }
     write("sweep.json", trade_off.json())?;
     write(PAGE_FILE, page(&trade_off))?;
-    // The marker file lets a later run recognize the folder as one that it may replace.
-    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": trade_off.tool })))?;
+    write_summary(staged.path(), &serde_json::json!({ "tool": trade_off.tool }))?;
     staged.commit()?;
     Ok(trade_off)
 }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use crate::diagnostics::demo_scene::{self, DemoBody, cameras_json};
 use crate::error::{Error, Result};
-use crate::files::atomic::{Replace, SUMMARY_FILE, ScratchFolder, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, ScratchFolder, StagedFolder, TargetKind, check_target, write_text};
 use crate::files::container::Container;
 use crate::memory_plan::Budget;
 use crate::model::Split;
@@ -110,8 +110,7 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
     let CompressedScene { mut summary, index_map: map } = compress_scene(&scene, &request)?;
     // The folder is still under its temporary name.
     summary.output.clear();
-    let marker = folder.join(SUMMARY_FILE);
-    fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
+    write_text(folder, SUMMARY_FILE, summary.json())?;
 
     let mut leaders = vec![false; summary.gaussians];
     let bodies = DemoBody::ALL

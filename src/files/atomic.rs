@@ -281,6 +281,24 @@ impl StagedFolder {
     }
 }
 
+/// Writes `text` to the file `name` in `folder`.
+///
+/// # Errors
+/// Fails if the file cannot be written.
+pub fn write_text(folder: &Path, name: &str, text: impl AsRef<[u8]>) -> Result<()> {
+    let path = folder.join(name);
+    fs::write(&path, text).map_err(Error::io("write", &path))
+}
+
+/// Writes the JSON object `summary` to the file [`SUMMARY_FILE`] in the output folder `folder`. By this file a later run
+/// recognizes the folder as one that it may replace.
+///
+/// # Errors
+/// Fails if the file cannot be written.
+pub fn write_summary(folder: &Path, summary: &serde_json::Value) -> Result<()> {
+    write_text(folder, SUMMARY_FILE, format!("{summary:#}\n"))
+}
+
 /// Creates the workspace (hidden folder) in which the output `target` is written. First repairs and removes the
 /// workspaces that killed runs with this output left behind. Fails if `target` exists and `replace` does not allow an
 /// output of the kind `kind` to replace it, or if a system call fails.

@@ -279,7 +279,7 @@ pub enum TimeOrigin {
 }
 
 /// Memory that an open input takes, and the time and memory that reading it takes.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct MemoryProfile {
     /// Bytes of memory per Gaussian while the input is open.
     pub per_gaussian: u64,
@@ -319,20 +319,13 @@ impl MemoryProfile {
     /// Returns the memory profile of a container whose tiles (the units of decoding) each hold `frame_block` frames.
     pub fn for_tiles(frame_block: u64) -> MemoryProfile {
         MemoryProfile {
-            per_gaussian: 0,
-            opening: 0,
             reader: 8,
-            compressed: 0,
-            jacobian: 0,
-            prepared: 0,
-            file: 0,
-            fixed: 0,
             frame_block,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: Attributes::all().iter().count() as u64,
             // Measured decoding time of tiles that are read whole (`benches/scan.rs`).
             seconds_per_state: 5e-8,
-            decoded: 0,
+            ..MemoryProfile::default()
         }
     }
 }

@@ -167,20 +167,12 @@ impl InputModel for PlySequence {
 
     fn memory_profile(&self) -> MemoryProfile {
         MemoryProfile {
-            per_gaussian: 0,
-            opening: 0,
             reader: 4,
-            compressed: 0,
-            jacobian: 0,
-            prepared: 0,
             // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
             file: state_bytes(self.info().sh_degree, Attributes::all()) + 24,
-            fixed: 0,
-            frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: 0,
             seconds_per_state: 1e-7,
-            decoded: 0,
+            ..MemoryProfile::default()
         }
     }
 

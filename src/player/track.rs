@@ -99,11 +99,6 @@ impl PageSequence {
             unseen: 0,
         }
     }
-
-    /// Returns the number of chunks: one for the first frame, and one per group.
-    pub fn chunk_count(&self) -> usize {
-        self.groups.len()
-    }
 }
 
 /// Returns the attributes that are encoded for every frame: the attributes that vary with time (`varying`) and, if
@@ -292,7 +287,7 @@ mod tests {
             Ok(())
         };
         encode(source, frames, &mut track, 2, &Events::IGNORED, sink).unwrap();
-        assert_eq!(chunks.len(), track.chunk_count());
+        assert_eq!(chunks.len(), track.groups.len());
         (track, chunks)
     }
 
@@ -301,7 +296,7 @@ mod tests {
         let scene = demo_scene::DemoScene::new(700, 47);
         let frames = [0, 1, 2, 5, 9, 12, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 46];
         let (track, chunks) = encoded(&scene, &frames, 3);
-        assert!(track.chunk_count() > 2 && track.groups.last() == Some(&frames.len()), "{:?}", track.groups);
+        assert!(track.groups.len() > 2 && track.groups.last() == Some(&frames.len()), "{:?}", track.groups);
         let found = unpacked(&track, &chunks);
         assert_eq!(found.len(), frames.len());
         let steps = track.steps;
@@ -332,7 +327,7 @@ mod tests {
     fn one_frame_is_one_chunk_and_degree_0_has_14_components() {
         let scene = demo_scene::DemoScene::new(300, 5);
         let (track, chunks) = encoded(&scene, &[3], 0);
-        assert_eq!((track.chunk_count(), track.sh_degree, track.varying.len()), (1, 0, 0));
+        assert_eq!((track.groups.len(), track.sh_degree, track.varying.len()), (1, 0, 0));
         let found = unpacked(&track, &chunks);
         assert_eq!((found.len(), found[0].len()), (1, 14));
         assert!(encoded(&scene, &[3], 3).1[0].len() >= chunks[0].len());

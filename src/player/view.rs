@@ -1,11 +1,10 @@
 //! `splatsieve view`: writes a page that plays one model, or two side by side.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::TOOL;
 use crate::error::{Error, Result};
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, StagedFile, StagedFolder, TargetKind, check_target, write_summary};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT};
@@ -174,9 +173,7 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     }
     let staged = StagedFolder::new(&folder, options.overwrite)?;
     let (names, bytes) = chunks.write_folder(&mut stage, staged.path())?;
-    let marker = staged.path().join(SUMMARY_FILE);
-    let summary = serde_json::json!({ "tool": TOOL, "page": INDEX_FILE, "frames": frames });
-    fs::write(&marker, format!("{summary:#}\n")).map_err(Error::io("write", &marker))?;
+    write_summary(staged.path(), &serde_json::json!({ "tool": TOOL, "page": INDEX_FILE, "frames": frames }))?;
     staged.commit()?;
     Ok(ViewReport { page: folder.join(INDEX_FILE), bytes, files: names.len(), frames, notes })
 }

@@ -34,7 +34,6 @@ mod tables;
 pub mod trade_off;
 mod verdict;
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -43,7 +42,7 @@ use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
 use crate::evaluation;
 use crate::evaluation::{EvaluateOptions, ModelPair, RenderedViews};
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, StagedFolder, TargetKind, check_target, write_summary, write_text};
 use crate::files::text::read_text;
 use crate::journal::Journal;
 use crate::journal::records::TermSummary;
@@ -362,18 +361,11 @@ fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFile
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");
     json.push('\n');
-    let marker = serde_json::json!({
-        "tool": report.tool,
-        "original": report.result.evaluation.path.original,
-        "compressed": report.result.evaluation.path.compressed,
-        "verdict": report.result.verdict,
-    });
     let mut files = vec![
         (PAGE_FILE, page.to_owned()),
         ("report.json", json),
         ("views.csv", report.result.evaluation.csv()),
         ("failure_modes.csv", tables::failure_modes(&report.result.failure_modes)),
-        (SUMMARY_FILE, format!("{marker:#}\n")),
     ];
     files.extend(report.result.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
     files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(&of.stages))));
@@ -382,8 +374,14 @@ fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFile
     files.extend(turned.map(|of| ("knobs.csv", of.knobs_csv())));
     files.extend(report.precision.as_ref().map(|of| ("precision.csv", of.csv())));
     for (name, text) in files {
-        let path = staged.path().join(name);
-        fs::write(&path, text).map_err(Error::io("write", &path))?;
+        write_text(staged.path(), name, text)?;
     }
+    let summary = serde_json::json!({
+        "tool": report.tool,
+        "original": report.result.evaluation.path.original,
+        "compressed": report.result.evaluation.path.compressed,
+        "verdict": report.result.verdict,
+    });
+    write_summary(staged.path(), &summary)?;
     staged.commit()
 }

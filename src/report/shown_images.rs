@@ -1,7 +1,7 @@
 //! Choice of the renders that the page shows, and their images.
 //!
 //! Input: first the quality measures of all renders, from which some renders are chosen; then the chosen renders, which
-//! the caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_RENDERS_PER_PAGE`]
+//! the caller renders a second time. Output: PNG files as data URIs. A page has at most four
 //! renders of at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
@@ -21,9 +21,6 @@ pub(super) const WORST: &str = "worst render";
 /// Reason for showing the render with the median PSNR, as text for the page.
 pub(super) const MEDIAN: &str = "median render";
 
-/// Maximum number of renders that the page shows: the worst one, the worst one of the worst view, the worst one of the
-/// worst frame, and the median one.
-pub const MAX_RENDERS_PER_PAGE: usize = 4;
 /// Maximum number of pixels of a shown image; larger renders are scaled down. Images of trained scenes take about 2
 /// bytes per pixel in base64.
 pub const MAX_PIXELS: u64 = 160_000;

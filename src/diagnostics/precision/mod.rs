@@ -18,7 +18,6 @@ mod ranking;
 mod runs;
 mod sums;
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::whole_run::{result_name, with_training_views};
@@ -26,7 +25,7 @@ use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::cost::RepeatLimits;
 use crate::evaluation::precision::{PrecisionDiagram, PrecisionKnob};
-use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
+use crate::files::atomic::{Replace, StagedFolder, TargetKind, check_target, write_summary, write_text};
 use crate::files::names::name_of;
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload};
@@ -303,15 +302,10 @@ fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, not
 
 /// Writes the results `diagram` to `folder`: a CSV table, a JSON file, and the page with the diagrams.
 fn write_files(diagram: &PrecisionDiagram, folder: &Path) -> Result<()> {
-    let write = |name: &str, text: String| {
-        let path = folder.join(name);
-        fs::write(&path, text).map_err(Error::io("write", &path))
-    };
-    write("precision.csv", diagram.csv())?;
-    write("precision.json", diagram.json())?;
-    write(PAGE_FILE, page(diagram))?;
-    // The marker file lets a later run recognize the folder as one that it may replace.
-    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": diagram.tool })))
+    write_text(folder, "precision.csv", diagram.csv())?;
+    write_text(folder, "precision.json", diagram.json())?;
+    write_text(folder, PAGE_FILE, page(diagram))?;
+    write_summary(folder, &serde_json::json!({ "tool": diagram.tool }))
 }
 
 impl Bench<'_> {

@@ -106,14 +106,7 @@ impl<R: Read> FrameStream<R> {
         &self.header
     }
 
-    /// Returns the attributes that are constant over all frames. In the returned value, the varying attributes are
-    /// empty.
-    pub fn constant_attributes(&self) -> &Gaussians {
-        &self.constant
-    }
-
-    /// Takes the attributes that are constant over all frames. Afterwards [`FrameStream::constant_attributes`] is
-    /// empty.
+    /// Takes the attributes that are constant over all frames. In the returned value, the varying attributes are empty.
     pub fn take_constant_attributes(&mut self) -> Gaussians {
         std::mem::take(&mut self.constant)
     }

@@ -39,7 +39,7 @@ fn states(scene: &DemoScene) -> Vec<Gaussians> {
 /// Reads the frame stream `bytes`. Returns the time and all attributes of each frame.
 fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
     let mut stream = FrameStream::open(bytes, Path::new("test"), ReadLimit::NONE)?;
-    let mut state = stream.constant_attributes().clone();
+    let mut state = stream.take_constant_attributes();
     let mut frames = Vec::new();
     while let Some(time) = stream.next_frame(&mut state)? {
         frames.push((time, state.clone()));

@@ -244,15 +244,12 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
             reader: 2 * whole + motion_model.bytes_per_gaussian() as u64 + 128,
             compressed: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
-            prepared: 0,
             file: whole + 24,
             // Two copies of the network's tensors: as read from the file, and as used.
             fixed: 2 * self.tensor_bytes + motion_model.bytes() as u64,
-            frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: 0,
             seconds_per_state: motion_model.seconds_per_state(),
-            decoded: 0,
+            ..MemoryProfile::default()
         }
     }
 

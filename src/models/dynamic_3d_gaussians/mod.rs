@@ -67,20 +67,12 @@ impl InputModel for Params {
 
     fn memory_profile(&self) -> MemoryProfile {
         MemoryProfile {
-            per_gaussian: 0,
-            opening: 0,
             reader: 8,
             // Scales and opacities of proxies (Gaussians that replace merged ones), and their indices.
             compressed: state_bytes(0, Attributes::all()) + 16,
-            jacobian: 0,
-            prepared: 0,
-            file: 0,
-            fixed: 0,
-            frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: 0,
             seconds_per_state: 2e-8,
-            decoded: 0,
+            ..MemoryProfile::default()
         }
     }
 

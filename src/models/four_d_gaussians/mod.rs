@@ -92,12 +92,10 @@ impl InputModel for ModelFolder {
             file: whole + 24,
             // Two copies of the field's tensors: as read from the file, and as used.
             fixed: 2 * self.tensor_bytes(),
-            frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: 0,
             // Seconds measured by `benches/deform.rs`, as a function of the size of the network.
             seconds_per_state: 1e-7 + 2e-11 * self.field().multiplications() as f64,
-            decoded: 0,
+            ..MemoryProfile::default()
         }
     }
 

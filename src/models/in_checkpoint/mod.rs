@@ -211,15 +211,11 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
             reader: whole + 128,
             compressed: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
-            prepared: 0,
             // The training stores two optimizer values per parameter in addition.
             file: 3 * whole,
-            fixed: 0,
-            frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: 0,
             seconds_per_state: self.description.seconds_per_state,
-            decoded: 0,
+            ..MemoryProfile::default()
         }
     }
 

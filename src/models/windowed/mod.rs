@@ -96,14 +96,10 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
             reader: whole + 16 + 8,
             compressed: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
-            prepared: 0,
             file: whole + 24,
-            fixed: 0,
-            frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: 0,
             seconds_per_state: 3e-8,
-            decoded: 0,
+            ..MemoryProfile::default()
         }
     }
 
