@@ -1,22 +1,26 @@
 //! Declaration of the command line: commands and their options.
 
+mod choices;
 mod shared;
 mod study;
 mod values;
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand};
 
-pub(super) use self::shared::{
-    CacheArgs, CameraFile, Cameras, DryRun, Earlier, FitTargetArg, Input, LinkArg, Memory, OutputKindArg, Rot4d,
-    SplitArg, Trained, ZeroRotationArg,
-};
+use self::choices::{FIT_TARGETS, IMAGE_FORMATS, LINK_MODES, OUTPUT_KINDS, SPLITS, choice};
+pub(super) use self::shared::{CacheArgs, CameraFile, Cameras, DryRun, Earlier, Input, Memory, Trained};
 pub(super) use self::study::{PrecisionArgs, Sweep};
 use self::values::{parse_box, parse_bytes, parse_color, parse_count, parse_decibels, parse_ratio, parse_threads};
 use super::recipe_flags::RecipeFlags;
 use splatsieve::diagnostics::demo_scene::Playground;
+use splatsieve::files::image::write::ImageFormat;
+use splatsieve::models::LinkMode;
 use splatsieve::outputs::bounds::MaxError;
+use splatsieve::outputs::kind::OutputKind;
+use splatsieve::pipeline::FitTarget;
+use splatsieve::scene::view_selection::ViewSet;
 
 /// Heading of the options for cameras in the help.
 const CAMERAS: &str = "Cameras";
@@ -114,8 +118,8 @@ impl CommandArgs {
 #[derive(Debug, Args)]
 pub(super) struct OutputFormat {
     /// Format of the output [default: by its name]
-    #[arg(long = "as", value_enum, value_name = "FORMAT")]
-    pub(super) kind: Option<OutputKindArg>,
+    #[arg(long = "as", value_name = "FORMAT", value_parser = choice(OUTPUT_KINDS))]
+    pub(super) kind: Option<OutputKind>,
     /// Version of a .spz: 3 opens in most viewers, 4 also in the PlayCanvas engine [default: 3]
     #[arg(long, value_name = "3|4", hide_short_help = true, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub(super) spz_version: Option<u8>,
@@ -205,8 +209,8 @@ pub(super) struct OutputSize {
     ///
     /// With photographs, a fit to photographs follows the fit to renders and takes about as long. Its result is kept
     /// if it raises the PSNR against photographs of cameras that the fit does not use.
-    #[arg(long, help_heading = HOW_SMALL, value_name = "IMAGES", hide_short_help = true)]
-    pub(super) toward: Option<FitTargetArg>,
+    #[arg(long, help_heading = HOW_SMALL, value_name = "IMAGES", hide_short_help = true, value_parser = choice(FIT_TARGETS))]
+    pub(super) toward: Option<FitTarget>,
 }
 
 /// Gaussians that the user keeps or drops.
@@ -276,11 +280,11 @@ pub(super) struct Render {
     #[arg(long, value_name = "MODEL")]
     pub(super) beside: Option<PathBuf>,
     /// Split of the views to render [default: with --all or --path: test, else val, else all; otherwise: all]
-    #[arg(long, value_enum)]
-    pub(super) split: Option<SplitArg>,
+    #[arg(long, value_parser = choice(SPLITS))]
+    pub(super) split: Option<ViewSet>,
     /// Format of the images of --all [default: png]
-    #[arg(long = "as", value_enum, value_name = "KIND", requires = "all")]
-    pub(super) format: Option<ImageKind>,
+    #[arg(long = "as", value_name = "KIND", requires = "all", value_parser = choice(IMAGE_FORMATS))]
+    pub(super) format: Option<ImageFormat>,
     #[command(flatten)]
     pub(super) background: Background,
     /// Output: NAME.png (8 bits, clamped), NAME.npy (float32 [H, W, 3], not clamped), or with --all a folder
@@ -293,15 +297,6 @@ pub(super) struct Render {
     pub(super) json: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
-}
-
-/// Formats of images.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum ImageKind {
-    /// 8 bits per channel, clamped
-    Png,
-    /// float32 [H, W, 3], not clamped
-    Npy,
 }
 
 /// Background color.
@@ -328,15 +323,15 @@ pub(super) struct CompareArgs {
     #[arg(long)]
     pub(super) allow_gaps: bool,
     /// Tracking of frames, as for `compress` [default: auto]
-    #[arg(long)]
-    pub(super) link: Option<LinkArg>,
+    #[arg(long, value_parser = choice(LINK_MODES))]
+    pub(super) link: Option<LinkMode>,
     #[command(flatten)]
     pub(super) memory: Memory,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
     /// Split of the data set whose views are compared [default: test, else val, else all]
-    #[arg(long, value_enum)]
-    pub(super) split: Option<SplitArg>,
+    #[arg(long, value_parser = choice(SPLITS))]
+    pub(super) split: Option<ViewSet>,
     /// Folder of photographs with which both models are also compared. File names: as in the camera file, else
     /// tNNN_vNN.png (frame, view)
     #[arg(long, value_name = "FOLDER")]
@@ -465,8 +460,8 @@ pub(super) struct Convert {
     #[command(flatten)]
     pub(super) cameras: CameraFile,
     /// Split of the data set whose views decide the quantization of an output NAME.gsz [default: train]
-    #[arg(long, value_enum, help_heading = CAMERAS)]
-    pub(super) split: Option<SplitArg>,
+    #[arg(long, help_heading = CAMERAS, value_parser = choice(SPLITS))]
+    pub(super) split: Option<ViewSet>,
     #[command(flatten)]
     pub(super) format: OutputFormat,
     /// Maximum error of an attribute in a .gseq, such as `position=1e-3` or `position=0.01%` of the scene's extent.

@@ -3,9 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use super::args::{
-    self, CacheArgs, CameraFile, Cameras, CompareArgs, Compress, Convert, Demo, ImageKind, Input, Memory, OutputFormat,
-    OutputKindArg, OutputSize, PrecisionArgs, Render, Rot4d, SplitArg, Sweep, TestScene, Trained, ViewArgs,
-    ZeroRotationArg,
+    self, CacheArgs, CameraFile, Cameras, CompareArgs, Compress, Convert, Demo, Input, Memory, OutputFormat,
+    OutputSize, PrecisionArgs, Render, Sweep, TestScene, Trained, ViewArgs,
 };
 use gseq::Compression;
 use splatsieve::cache::CacheRequest;
@@ -25,7 +24,7 @@ use splatsieve::files::image::write::ImageFormat;
 use splatsieve::machine::return_freed_memory;
 use splatsieve::memory_plan::{Budget, Verbosity};
 use splatsieve::model::Split;
-use splatsieve::models::{LinkMode, TrainingConventions, ZeroRotation};
+use splatsieve::models::{LinkMode, TrainingConventions};
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::pipeline::{FitTarget, PruneOrMerge, Request, RunOptions, Target};
 use splatsieve::player::view;
@@ -46,7 +45,7 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
     let kind = requested_kind(&args.format, &args.output)?;
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
-    let is_flipped = args.input.trained.rot4d == Some(Rot4d::Flipped);
+    let is_flipped = args.input.trained.rot4d == Some(false);
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     input.work = cache_request(args.cache_args);
     if input.memory.tell == Verbosity::Nothing && !quiet {
@@ -97,7 +96,7 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
     };
     // A target on the command line replaces the target of the recorded run.
     let is_open = given == RunOptions::default();
-    let toward = toward.map_or(run.toward, FitTarget::from);
+    let toward = toward.unwrap_or(run.toward);
     let mut chosen = RunOptions { toward, ..if is_open { run.clone() } else { given } };
     let needs_photographs = chosen.max_loss.is_some() || toward == FitTarget::Photographs;
     chosen.ground_truth = ground_truth;
@@ -139,10 +138,7 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
     if let Some((flag, _)) = video_flags.into_iter().find(|(_, given)| *given) {
         return Err(Error::usage(format!("{flag} needs --video FILE")));
     }
-    let format = match args.format {
-        Some(ImageKind::Npy) => ImageFormat::Npy,
-        Some(ImageKind::Png) | None => ImageFormat::Png,
-    };
+    let format = args.format.unwrap_or(ImageFormat::Png);
     let (selection, views) = match args.frame.zip(args.view) {
         Some((frame, view)) => (RenderSelection::One { frame: frame as usize, view }, ViewSet::All),
         None => (RenderSelection::All(format), ViewSet::HeldOut),
@@ -162,7 +158,7 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
     Ok(RenderOptions {
         input,
         selection,
-        views: args.split.map_or(views, view_set),
+        views: args.split.unwrap_or(views),
         background: args.background.background,
         output,
         overwrite: args.earlier.replace(),
@@ -182,7 +178,7 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
         input,
         beside: args.beside,
         path,
-        views: args.split.map_or(views, view_set),
+        views: args.split.unwrap_or(views),
         fps: args.fps.unwrap_or(25),
         background: args.background.background,
         output,
@@ -195,7 +191,7 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
 pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
-    original.link = args.link.map_or(LinkMode::Auto, LinkMode::from);
+    original.link = args.link.unwrap_or(LinkMode::Auto);
     original.conventions = conventions(&args.trained);
     args.cameras.apply_to(&mut original);
     original.memory = memory_budget(args.memory);
@@ -204,7 +200,7 @@ pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOp
         original,
         compressed: args.compressed,
         ground_truth: args.ground_truth,
-        views: args.split.map_or(ViewSet::HeldOut, view_set),
+        views: args.split.unwrap_or(ViewSet::HeldOut),
         max_frames: args.max_frames.map(|frames| frames as usize),
         max_views: args.max_views.map(|views| views as usize),
         background: args.background.background,
@@ -349,48 +345,12 @@ pub(super) fn storage_precision(args: &Convert) -> StoragePrecision {
 /// # Errors
 /// Fails if a version of `.spz` is named for an output of another format.
 pub(super) fn requested_kind(format: &OutputFormat, output: &Path) -> Result<Option<OutputKind>> {
-    let kind = format.kind.map(output_kind);
+    let kind = format.kind;
     let Some(version) = format.spz_version else { return Ok(kind) };
     if OutputKind::from_path(output, kind, OutputKind::Model) != OutputKind::Spz {
         return Err(Error::usage(format!("--spz-version: expected an output NAME.spz, found {}", output.shown())));
     }
     Ok(if version == 4 { Some(OutputKind::Spz4) } else { kind })
-}
-
-/// Converts the output format `kind` from the type of the argument parser to the type of the library.
-fn output_kind(kind: OutputKindArg) -> OutputKind {
-    match kind {
-        OutputKindArg::Model => OutputKind::Model,
-        OutputKindArg::Gseq => OutputKind::Gseq,
-        OutputKindArg::PlySequence => OutputKind::PlySequence,
-        OutputKindArg::Ply => OutputKind::Ply,
-        OutputKindArg::Archive => OutputKind::Archive,
-        OutputKindArg::Splatv => OutputKind::Splatv,
-        OutputKindArg::FourDgs => OutputKind::FourDgs,
-        OutputKindArg::Spz => OutputKind::Spz,
-        OutputKindArg::Sog => OutputKind::Sog,
-        OutputKindArg::Glb => OutputKind::Glb,
-        OutputKindArg::SogSequence => OutputKind::SogSequence,
-        OutputKindArg::Tsog => OutputKind::Tsog,
-        OutputKindArg::Ftgs => OutputKind::Ftgs,
-        OutputKindArg::Gsd => OutputKind::Gsd,
-    }
-}
-
-/// Converts the split `named` from the type of the argument parser to the type of the library. Returns `None` for the
-/// views of all splits.
-fn split(named: SplitArg) -> Option<Split> {
-    match named {
-        SplitArg::Train => Some(Split::Train),
-        SplitArg::Val => Some(Split::Val),
-        SplitArg::Test => Some(Split::Test),
-        SplitArg::All => None,
-    }
-}
-
-/// Returns the set of views of the split `named`.
-fn view_set(named: SplitArg) -> ViewSet {
-    split(named).map_or(ViewSet::All, ViewSet::Split)
 }
 
 /// Returns the cache folder and the shard (part of a divided stage) that the arguments name; `None` without `--cache`.
@@ -410,12 +370,8 @@ fn memory_budget(memory: Memory) -> Budget {
 /// Returns the training conventions (facts about the training that model files do not record) that the command line
 /// states in `trained`.
 fn conventions(trained: &Trained) -> TrainingConventions {
-    let zero_rotation = trained.zero_rotation.map(|handling| match handling {
-        ZeroRotationArg::Drop => ZeroRotation::Drop,
-        ZeroRotationArg::Identity => ZeroRotation::Identity,
-    });
-    let rot4d_unflipped = trained.rot4d == Some(Rot4d::Unflipped);
-    TrainingConventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
+    let &Trained { time_duration, rot4d, zero_rotation } = trained;
+    TrainingConventions { time_duration, rot4d_unflipped: rot4d.unwrap_or(false), zero_rotation }
 }
 
 /// Returns the library's options for opening an input. If `cameras` is `None`, cameras and split keep their defaults.
@@ -431,13 +387,17 @@ pub(super) fn input_options(
     let mut options = InputOptions { path: input.input, iteration: input.iteration, events, ..InputOptions::default() };
     options.allow_gaps = input.allow_gaps;
     options.conventions = conventions(&input.trained);
-    options.link = input.link.map_or(LinkMode::Auto, LinkMode::from);
+    options.link = input.link.unwrap_or(LinkMode::Auto);
     options.memory = memory_budget(input.memory);
     options.is_scratch_named = input.scratch_dir.is_some();
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
         cameras.file.apply_to(&mut options);
-        options.split = cameras.split.map_or(Some(Split::Train), split);
+        options.split = match cameras.split {
+            None => Some(Split::Train),
+            Some(ViewSet::Split(split)) => Some(split),
+            Some(ViewSet::All | ViewSet::HeldOut) => None,
+        };
     }
     options
 }

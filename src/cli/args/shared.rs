@@ -4,13 +4,14 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
+use super::choices::{LINK_MODES, ROTATION_LAYOUTS, SPLITS, ZERO_ROTATIONS, choice};
 use super::values::{parse_bytes, parse_duration, parse_size, parse_times};
 use super::{CACHE, CAMERAS, MACHINE};
 use splatsieve::cache::Shard;
 use splatsieve::files::atomic::Replace;
 use splatsieve::files::cameras::TimesSource;
-use splatsieve::models::LinkMode;
-use splatsieve::pipeline::FitTarget;
+use splatsieve::models::{LinkMode, ZeroRotation};
+use splatsieve::scene::view_selection::ViewSet;
 
 /// Input of a command.
 #[derive(Debug, Args)]
@@ -28,8 +29,8 @@ pub(in crate::cli) struct Input {
     pub(in crate::cli) allow_gaps: bool,
     /// When to match the Gaussians of each frame with those of the next (tracking), for sequences whose frames list
     /// their Gaussians in different orders [default: auto]
-    #[arg(long, hide_short_help = true)]
-    pub(in crate::cli) link: Option<LinkArg>,
+    #[arg(long, hide_short_help = true, value_parser = choice(LINK_MODES))]
+    pub(in crate::cli) link: Option<LinkMode>,
     /// Folder for temporary files: frames of a stream, tracked frames, and data that do not fit into --memory [default:
     /// the folder that contains the output, else the system's folder for temporary files]
     #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
@@ -47,30 +48,12 @@ pub(in crate::cli) struct Trained {
     pub(in crate::cli) time_duration: Option<f64>,
     /// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint. unflipped: trained with code from before 15
     /// September 2024 [default: flipped]
-    #[arg(long, value_name = "HOW", hide_short_help = true)]
-    pub(in crate::cli) rot4d: Option<Rot4d>,
+    #[arg(long, value_name = "HOW", hide_short_help = true, value_parser = choice(ROTATION_LAYOUTS))]
+    pub(in crate::cli) rot4d: Option<bool>,
     /// Handling of Gaussians of a .splatv or .ftgs.ply whose quaternion is zero; players do not draw them [default:
     /// drop]
-    #[arg(long, value_name = "HOW", hide_short_help = true)]
-    pub(in crate::cli) zero_rotation: Option<ZeroRotationArg>,
-}
-
-/// Handling of Gaussians of a .splatv or .ftgs.ply whose quaternion is zero.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(in crate::cli) enum ZeroRotationArg {
-    /// Remove Gaussians with a zero quaternion
-    Drop,
-    /// Keep Gaussians with a zero quaternion, with the identity rotation
-    Identity,
-}
-
-/// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(in crate::cli) enum Rot4d {
-    /// Rows and columns of the 4D rotation matrix in reverse order (code since 15 September 2024)
-    Flipped,
-    /// Product of both quaternions as it is (older code)
-    Unflipped,
+    #[arg(long, value_name = "HOW", hide_short_help = true, value_parser = choice(ZERO_ROTATIONS))]
+    pub(in crate::cli) zero_rotation: Option<ZeroRotation>,
 }
 
 /// Cache folder of a run, for resuming it and for dividing it among several processes.
@@ -143,32 +126,8 @@ pub(in crate::cli) struct Cameras {
     #[command(flatten)]
     pub(in crate::cli) file: CameraFile,
     /// Split of the data set whose views Gaussians are scored by [default: train]
-    #[arg(long, value_enum, help_heading = CAMERAS)]
-    pub(in crate::cli) split: Option<SplitArg>,
-}
-
-/// Condition under which frames are tracked.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(in crate::cli) enum LinkArg {
-    /// Only where the number of Gaussians changes or their order is not the same
-    Auto,
-    /// Always, also for a container or a stream
-    Always,
-    /// Always, but do not join tracks that seem to show the same Gaussian, and store small changes too
-    Apart,
-    /// Never: the same index means the same Gaussian
-    Never,
-}
-
-impl From<LinkArg> for LinkMode {
-    fn from(given: LinkArg) -> LinkMode {
-        match given {
-            LinkArg::Auto => LinkMode::Auto,
-            LinkArg::Always => LinkMode::Always,
-            LinkArg::Apart => LinkMode::Apart,
-            LinkArg::Never => LinkMode::Never,
-        }
-    }
+    #[arg(long, help_heading = CAMERAS, value_parser = choice(SPLITS))]
+    pub(in crate::cli) split: Option<ViewSet>,
 }
 
 /// What a dry run prints.
@@ -178,70 +137,4 @@ pub(in crate::cli) enum DryRun {
     Plan,
     /// Stages that --shard divides, in order, with their units
     Stages,
-}
-
-/// Images to which refinement fits the Gaussians.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(in crate::cli) enum FitTargetArg {
-    /// Renders of the original
-    Renders,
-    /// Renders of the original, then photographs of the training views
-    Photographs,
-}
-
-impl From<FitTargetArg> for FitTarget {
-    fn from(given: FitTargetArg) -> FitTarget {
-        match given {
-            FitTargetArg::Renders => FitTarget::Renders,
-            FitTargetArg::Photographs => FitTarget::Photographs,
-        }
-    }
-}
-
-/// Split of a data set.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(in crate::cli) enum SplitArg {
-    /// Training views
-    Train,
-    /// Validation views (transforms_val.json)
-    Val,
-    /// Test views
-    Test,
-    /// Every view
-    All,
-}
-
-/// Formats of an output.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(in crate::cli) enum OutputKindArg {
-    /// Model folder in the format of the input
-    Model,
-    /// Container with all frames (.gseq)
-    Gseq,
-    /// Folder with one PLY file per frame
-    PlySequence,
-    /// One PLY file: a single frame; of 4DGaussians also the canonical Gaussians, of SpacetimeGaussians
-    /// the model with its motion
-    Ply,
-    /// Archive (.gsz), the smallest: to store and to send
-    Archive,
-    /// Gaussians with cubic motion in time windows, for splaTV and WebGS
-    Splatv,
-    /// Gaussians with linear motion in pieces, for readers of 4dgs
-    #[value(name = "4dgs")]
-    FourDgs,
-    /// One frame, for web viewers (.spz)
-    Spz,
-    /// One frame as images, for web viewers (.sog)
-    Sog,
-    /// One frame, uncompressed, for viewers of glTF (.glb)
-    Glb,
-    /// Folder with one .sog per frame, for the flip book of PlayCanvas
-    SogSequence,
-    /// Gaussians with linear motion in time windows as images, the smallest for web viewers (.tsog)
-    Tsog,
-    /// Gaussians with linear motion in time windows, for ftgs-player (.ftgs.ply)
-    Ftgs,
-    /// Every frame in full, for SplatRenderer of Unreal (.gsd)
-    Gsd,
 }
