@@ -22,6 +22,7 @@ use splatsieve::diagnostics::{demo, precision, selfcheck, sweep, test_scene};
 use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::evaluation;
 use splatsieve::evaluation::EvaluateOptions;
+use splatsieve::files::text::json_text;
 use splatsieve::pipeline::summary::SummaryDetail;
 use splatsieve::pipeline::{self, compress, shardable_stages};
 use splatsieve::player::view;
@@ -80,12 +81,12 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
         }
         Some(DryRun::Plan) => {
             let foreseen = pipeline::dry_run(&request)?;
-            return print_as(json, || foreseen.json(), || foreseen.text());
+            return print_as(json, || json_text(&foreseen), || foreseen.text());
         }
     }
     let page = page_output.map(|output| result_page_options(&request, output)).transpose()?;
     let Some(summary) = completed(compress(&request)?)? else { return Ok(()) };
-    let printed = print_as(json, || summary.json(), || summary.text(detail));
+    let printed = print_as(json, || json_text(&summary), || summary.text(detail));
     // The page is written even if the summary cannot be printed, for example because its reader has ended.
     if let Some(page) = page {
         let written = write_page(&page);
@@ -155,14 +156,14 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
 fn run_sweep(args: Sweep, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(trade_off::PAGE_FILE));
     let found = sweep::sweep(&sweep_options(args, events))?;
-    print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
+    print_as(as_json, || json_text(&found), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs the command `precision` and prints its measurements and the path of its page.
 fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(report::precision::PAGE_FILE));
     let found = precision::precision(&precision_options(args, events)?)?;
-    print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
+    print_as(as_json, || json_text(&found), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs the command `report` and prints the verdict on each compressed model, the notes, and the path of the page.
@@ -384,11 +385,4 @@ fn tell_notes(notes: &[String]) {
     for note in notes {
         show(&format!("note: {note}"));
     }
-}
-
-/// Returns `value` as indented JSON that ends with a line feed.
-fn json_text(value: &impl serde::Serialize) -> String {
-    let mut text = serde_json::to_string_pretty(value).expect("plain data");
-    text.push('\n');
-    text
 }

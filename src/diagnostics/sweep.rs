@@ -16,6 +16,7 @@ use crate::evaluation::method::{Method, MethodKind, STEPS, refining_by};
 use crate::evaluation::trade_off::{EffortCurve, EffortSetting, TradeOff, TradeOffPoint};
 use crate::files::atomic::{Replace, StagedFolder, TargetKind, check_target, write_summary, write_text};
 use crate::files::names::name_of;
+use crate::files::text::json_text;
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::Target;
 use crate::report::trade_off::{PAGE_FILE, page};
@@ -122,7 +123,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     if !trade_off.knobs.is_empty() {
         write("knobs.csv", trade_off.knobs_csv())?;
     }
-    write("sweep.json", trade_off.json())?;
+    write("sweep.json", json_text(&trade_off))?;
     write(PAGE_FILE, page(&trade_off))?;
     write_summary(staged.path(), &serde_json::json!({ "tool": trade_off.tool }))?;
     staged.commit()?;

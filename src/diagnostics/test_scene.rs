@@ -11,6 +11,7 @@ use crate::diagnostics::demo_scene::{self, DemoBody, cameras_json};
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, SUMMARY_FILE, ScratchFolder, StagedFolder, TargetKind, check_target, write_text};
 use crate::files::container::Container;
+use crate::files::text::json_text;
 use crate::memory_plan::Budget;
 use crate::model::Split;
 use crate::models::trajectories::write_sequence;
@@ -110,7 +111,7 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
     let CompressedScene { mut summary, index_map: map } = compress_scene(&scene, &request)?;
     // The folder is still under its temporary name.
     summary.output.clear();
-    write_text(folder, SUMMARY_FILE, summary.json())?;
+    write_text(folder, SUMMARY_FILE, json_text(&summary))?;
 
     let mut leaders = vec![false; summary.gaussians];
     let bodies = DemoBody::ALL

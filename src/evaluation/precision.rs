@@ -257,13 +257,6 @@ pub(crate) fn added_error(error: f64, finest: f64) -> f64 {
 }
 
 impl PrecisionDiagram {
-    /// Returns all measurements as indented JSON.
-    pub fn json(&self) -> String {
-        let mut text = serde_json::to_string_pretty(self).expect("plain data");
-        text.push('\n');
-        text
-    }
-
     /// Returns the measurements as a CSV table with one row per error of every setting. A missing value is an empty
     /// field.
     pub fn csv(&self) -> String {
@@ -360,6 +353,7 @@ impl PrecisionDiagram {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::files::text::json_text;
 
     fn mark(value: f64, step: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
         let seconds = MedianAndRange::from_values(vec![value]);
@@ -442,6 +436,6 @@ mod tests {
         let lines: Vec<&str> = csv.lines().collect();
         assert_eq!(lines[1], "percentiles,discretization,bits,2,0.25,0.5,C,,1,2,2,2,,,,7");
         assert_eq!(lines.len(), 3);
-        assert_eq!(serde_json::from_str::<PrecisionDiagram>(&found.json()).unwrap(), found);
+        assert_eq!(serde_json::from_str::<PrecisionDiagram>(&json_text(&found)).unwrap(), found);
     }
 }

@@ -86,13 +86,6 @@ const COLUMNS: [&str; 10] =
     ["method", "asked", "count", "fraction", "bytes", "psnr", "ssim", "temporal", "seconds", "peak_memory_bytes"];
 
 impl TradeOff {
-    /// Returns the result of the sweep as indented JSON.
-    pub fn json(&self) -> String {
-        let mut text = serde_json::to_string_pretty(self).expect("plain data");
-        text.push('\n');
-        text
-    }
-
     /// Returns the measurements of the methods ([`TradeOff::points`]) as a CSV table with one row per point (method and
     /// kept fraction). A missing value is an empty field.
     pub fn csv(&self) -> String {

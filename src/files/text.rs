@@ -1,11 +1,23 @@
-//! Readers of text files in UTF-8, with or without a byte order mark.
+//! Readers of text files in UTF-8, with or without a byte order mark, and JSON text for output.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
+
 use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
+
+/// Returns `value` as indented JSON that ends with a line feed.
+///
+/// # Panics
+/// Panics if the serializer of `value` fails, which the derived ones of results never do.
+pub fn json_text(value: &impl Serialize) -> String {
+    let mut text = serde_json::to_string_pretty(value).expect("plain data");
+    text.push('\n');
+    text
+}
 
 /// Reads the text file at `path`, which may have at most `most_bytes` bytes, and removes a byte order mark.
 ///

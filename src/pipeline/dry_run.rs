@@ -131,13 +131,6 @@ fn size_by(request: &Request) -> String {
 }
 
 impl DryRunReport {
-    /// Returns this report of a dry run as JSON text, for other programs.
-    pub fn json(&self) -> String {
-        let mut text = serde_json::to_string_pretty(self).expect("plain data");
-        text.push('\n');
-        text
-    }
-
     /// Returns this report of a dry run as text for display.
     pub fn text(&self) -> String {
         let mut out = String::new();

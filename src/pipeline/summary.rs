@@ -294,11 +294,4 @@ impl Summary {
     pub fn full_reads(&self) -> f64 {
         self.stages.iter().map(|stage| stage.full_reads).sum()
     }
-
-    /// Returns this summary of a run as JSON text, for other programs.
-    pub fn json(&self) -> String {
-        let mut text = serde_json::to_string_pretty(self).expect("a summary is plain data");
-        text.push('\n');
-        text
-    }
 }

@@ -43,7 +43,7 @@ use crate::error::{Error, Result};
 use crate::evaluation;
 use crate::evaluation::{EvaluateOptions, ModelPair, RenderedViews};
 use crate::files::atomic::{Replace, StagedFolder, TargetKind, check_target, write_summary, write_text};
-use crate::files::text::read_text;
+use crate::files::text::{json_text, read_text};
 use crate::journal::Journal;
 use crate::journal::records::TermSummary;
 use crate::model::{Camera, Gaussians, Split, StatisticRows, ViewSchedule};
@@ -359,11 +359,9 @@ fn show_again(
 /// content of `report` and the stages of `run`.
 fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFiles) -> Result<()> {
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
-    let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");
-    json.push('\n');
     let mut files = vec![
         (PAGE_FILE, page.to_owned()),
-        ("report.json", json),
+        ("report.json", json_text(report)),
         ("views.csv", report.result.evaluation.csv()),
         ("failure_modes.csv", tables::failure_modes(&report.result.failure_modes)),
     ];

@@ -27,6 +27,7 @@ use crate::evaluation::cost::RepeatLimits;
 use crate::evaluation::precision::{PrecisionDiagram, PrecisionKnob};
 use crate::files::atomic::{Replace, StagedFolder, TargetKind, check_target, write_summary, write_text};
 use crate::files::names::name_of;
+use crate::files::text::json_text;
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload};
 use crate::model::{StatisticRows, ViewSchedule};
@@ -303,7 +304,7 @@ fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, not
 /// Writes the results `diagram` to `folder`: a CSV table, a JSON file, and the page with the diagrams.
 fn write_files(diagram: &PrecisionDiagram, folder: &Path) -> Result<()> {
     write_text(folder, "precision.csv", diagram.csv())?;
-    write_text(folder, "precision.json", diagram.json())?;
+    write_text(folder, "precision.json", json_text(diagram))?;
     write_text(folder, PAGE_FILE, page(diagram))?;
     write_summary(folder, &serde_json::json!({ "tool": diagram.tool }))
 }

@@ -15,6 +15,7 @@ use crate::files::atomic::{
 };
 use crate::files::names::name_of;
 use crate::files::sog::images::morton_order;
+use crate::files::text::json_text;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload, bytes_of_survivors};
@@ -331,7 +332,7 @@ impl WriteStage {
             write_text(&staged.path().join(RECIPE_FILE), recipe)?;
             write_index_map(map, &staged.path().join(INDEX_MAP_FILE))?;
             let summary = summarize(staged.path(), journal, size)?;
-            write_text(&staged.path().join(SUMMARY_FILE), &summary.json())?;
+            write_text(&staged.path().join(SUMMARY_FILE), &json_text(&summary))?;
             staged.commit()?;
             return Ok(summary);
         }
@@ -341,7 +342,7 @@ impl WriteStage {
         write_text(&recipe_file, recipe)?;
         write_index_map(map, &index_map)?;
         let summary = summarize(staged.path(), journal, size)?;
-        write_text(&marker, &summary.json())?;
+        write_text(&marker, &json_text(&summary))?;
         staged.commit()?;
         Ok(summary)
     }
