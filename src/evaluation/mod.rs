@@ -47,7 +47,7 @@ use crate::render::Image;
 use crate::scene::photographs::Photographs;
 use crate::scene::view_selection::{self, ViewSet, render_background, select_frames, select_views, spread_views};
 use crate::scene::views_outside::{RigCone, training_cameras};
-use crate::scene::{InputOptions, Scene, check_compressed, open_compressed, open_scene};
+use crate::scene::{InputOptions, Scene, check_compressed, open_compressed, open_scene, tracking_notes};
 
 /// Name of the evaluation stage, for progress and cache entries.
 const NAME: &str = "evaluate";
@@ -347,13 +347,10 @@ impl ModelPair {
             original: scene.path.to_string_lossy().into_owned(),
             compressed: self.compressed_as.path.to_string_lossy().into_owned(),
         };
-        let tracked = [("original", &*scene.input), ("compressed", &*self.compressed)];
-        let note =
-            |(role, input): (&str, &dyn InputModel)| Some(format!("the {role} model: {}", input.tracking_note()?));
         let size = OriginalAndCompressed { original: scene.input.size()?, compressed: self.compressed.size()? };
         let larger = size.compressed.why_larger_than(&size.original);
         Ok(Evaluation {
-            notes: (blind.map(str::to_owned).into_iter().chain(tracked.into_iter().filter_map(note)))
+            notes: (blind.map(str::to_owned).into_iter().chain(tracking_notes(&*scene.input, &*self.compressed)))
                 .chain(scene.notes.iter().cloned().chain(larger))
                 .collect(),
             tool: TOOL.to_owned(),

@@ -76,3 +76,11 @@ pub fn open_compressed(
         None => Ok(input),
     }
 }
+
+/// Returns a note for each of the two models whose frames were linked, so that its renders differ from those of its
+/// input files.
+pub fn tracking_notes(original: &dyn InputModel, compressed: &dyn InputModel) -> impl Iterator<Item = String> {
+    [("original", original.tracking_note()), ("compressed", compressed.tracking_note())]
+        .into_iter()
+        .filter_map(|(role, note)| Some(format!("the {role} model: {}", note?)))
+}

@@ -25,7 +25,7 @@ use crate::progress::Events;
 use crate::source::ReadCounts;
 
 use absent::Absent;
-pub use compressed::{check_compressed, open_compressed};
+pub use compressed::{check_compressed, open_compressed, tracking_notes};
 pub use input::{InputOptions, OpenedInput, UntrackedInput, with_cameras};
 pub use open::{first_frame_box, from_input, open_input, open_scene, open_untracked, scratch_beside};
 pub use stream::{
