@@ -377,7 +377,7 @@ mod tests {
         scan.advanced(626_490);
         let single = log("emit", "frames", Some(1));
         single.done.store(1, Ordering::Relaxed);
-        assert_eq!(single.line(Duration::from_secs(1), true), "emit  1 frame, 1 frames/s, 1.0 s");
+        assert_eq!(single.line(Duration::from_secs(1), true), "emit  1 frame, 1.0 frames/s, 1.0 s");
         assert_eq!(scan.line(Duration::from_millis(404), true), "scan  1,252,980 states, 3.1 M states/s, 0.4 s");
         let counter = log("receive", "frames", None);
         counter.advanced(72);

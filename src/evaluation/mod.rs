@@ -349,10 +349,9 @@ impl ModelPair {
         };
         let size = OriginalAndCompressed { original: scene.input.size()?, compressed: self.compressed.size()? };
         let larger = size.compressed.why_larger_than(&size.original);
+        let notes = blind.map(str::to_owned).into_iter().chain(tracking_notes(&*scene.input, &*self.compressed));
         Ok(Evaluation {
-            notes: (blind.map(str::to_owned).into_iter().chain(tracking_notes(&*scene.input, &*self.compressed)))
-                .chain(scene.notes.iter().cloned().chain(larger))
-                .collect(),
+            notes: notes.chain(scene.notes.iter().cloned()).chain(larger).collect(),
             tool: TOOL.to_owned(),
             path,
             count: OriginalAndCompressed { original: count(&*scene.input), compressed: count(&*self.compressed) },
