@@ -190,7 +190,7 @@ pub(super) struct OutputSize {
     pub(super) count: Option<u64>,
     /// Best output of at most this many bytes, such as 5MB
     ///
-    /// The files beside the output (summary, recipe, index map) do not count.
+    /// The summary, the recipe and the index map do not count, even inside an output folder.
     #[arg(long, help_heading = HOW_SMALL, value_name = "BYTES", group = "size_of_output", value_parser = parse_bytes)]
     pub(super) size: Option<u64>,
     /// Smallest output whose renders have at least this mean PSNR against renders of the original, such as 35dB

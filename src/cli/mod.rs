@@ -60,11 +60,12 @@ pub(crate) fn main() -> ExitCode {
 /// Parses the words of a command line. The first word is the name of the program.
 fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<Cli, clap::Error> {
     let parsed = help::command().try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found));
-    parsed.map_err(with_plain_type)
+    parsed.map_err(with_plain_number_error)
 }
 
-/// Returns `error`, in which an error of Rust about a text that is no number says in plain words what was expected.
-fn with_plain_type(error: clap::Error) -> clap::Error {
+/// Returns `error`. If a value could not be parsed as a number, its message names the expected kind of number instead of
+/// the error of Rust's parser.
+fn with_plain_number_error(error: clap::Error) -> clap::Error {
     let source = std::error::Error::source(&error);
     let expected = match source {
         Some(source) if source.is::<ParseIntError>() => "a whole number",

@@ -45,7 +45,7 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
     let kind = requested_kind(&args.format, &args.output)?;
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
-    let is_flipped = args.input.trained.rot4d == Some(false);
+    let is_flipped = args.input.trained.rot4d_unflipped == Some(false);
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     input.work = cache_request(args.cache_args);
     if input.memory.tell == Verbosity::Nothing && !quiet {
@@ -370,8 +370,8 @@ fn memory_budget(memory: Memory) -> Budget {
 /// Returns the training conventions (facts about the training that model files do not record) that the command line
 /// states in `trained`.
 fn conventions(trained: &Trained) -> TrainingConventions {
-    let &Trained { time_duration, rot4d, zero_rotation } = trained;
-    TrainingConventions { time_duration, rot4d_unflipped: rot4d.unwrap_or(false), zero_rotation }
+    let &Trained { time_duration, rot4d_unflipped, zero_rotation } = trained;
+    TrainingConventions { time_duration, rot4d_unflipped: rot4d_unflipped.unwrap_or(false), zero_rotation }
 }
 
 /// Returns the library's options for opening an input. If `cameras` is `None`, cameras and split keep their defaults.

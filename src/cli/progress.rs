@@ -375,13 +375,13 @@ mod tests {
         assert_eq!(scan.line(minute, false), "scan  626,490 of 1,252,980 states, 10 k states/s, 1 min 00 s left");
         assert_eq!(scan.line(minute, true), "scan  626,490 of 1,252,980 states, 10 k states/s, 1 min 00 s");
         scan.advanced(626_490);
-        let single = log("emit", "frames", Some(1));
-        single.done.store(1, Ordering::Relaxed);
-        assert_eq!(single.line(Duration::from_secs(1), true), "emit  1 frame, 1.0 frames/s, 1.0 s");
         assert_eq!(scan.line(Duration::from_millis(404), true), "scan  1,252,980 states, 3.1 M states/s, 0.4 s");
         let counter = log("receive", "frames", None);
         counter.advanced(72);
         assert_eq!(counter.line(Duration::from_secs(7200), false), "receive  72 frames, 1 min 40 s each, 2 h 00 min");
+        let single = log("emit", "frames", Some(1));
+        single.done.store(1, Ordering::Relaxed);
+        assert_eq!(single.line(Duration::from_secs(1), true), "emit  1 frame, 1.0 frames/s, 1.0 s");
     }
 
     #[test]

@@ -108,12 +108,12 @@ pub fn unpack_archive(
     Ok(Some(converted(OutputKind::Model, bytes)))
 }
 
-/// Checks that the user does not ask for one frame (`--frames 1`) of the moving model `model` in an output of the kind
-/// `kind`, which would hold the whole model. `input` holds the options of the user, `output` the path of the output.
+/// Checks that `--frames 1` is not combined with an output of the kind `kind` that stores the motion of the continuous
+/// model `model`: it would hold all frames. `input` holds the options of the user, `output` the path of the output.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] with outputs that hold one frame.
-pub fn check_frame_is_asked_of_frames(
+pub fn check_frame_count_applies(
     input: &InputOptions,
     model: &dyn InputModel,
     kind: OutputKind,
@@ -146,7 +146,7 @@ pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) ->
     }
     check_target(output, TargetKind::File, &[&input.path], overwrite)?;
     let mut scene = open_scene(input)?;
-    check_frame_is_asked_of_frames(input, &*scene.input, OutputKind::Archive, output)?;
+    check_frame_count_applies(input, &*scene.input, OutputKind::Archive, output)?;
     scene.input.check_output(OutputKind::Archive, output)?;
     let stage = ArchiveStage { psnr: None, refine: None };
     scene.plan_memory(input.memory, |work, limits| vec![stage.resource_estimate(work, limits)])?;

@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use crate::TOOL;
-use crate::commands::archive::{check_frame_is_asked_of_frames, is_archive, unpack_archive, write_archive};
+use crate::commands::archive::{check_frame_count_applies, is_archive, unpack_archive, write_archive};
 use crate::commands::convert_report::ConvertReport;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
@@ -77,7 +77,7 @@ pub fn convert(
     let target = if kind.is_folder() { TargetKind::Folder } else { TargetKind::File };
     check_target(output, target, &[&input.path], overwrite)?;
     let (gaussians, frames) = (source.info().count, source.info().times.len());
-    check_frame_is_asked_of_frames(input, model, kind, output)?;
+    check_frame_count_applies(input, model, kind, output)?;
     kind.check_frames(frames, output)?;
     model.check_output(kind, output)?;
     let work = Workload::new(source.info(), model.memory_profile());

@@ -118,7 +118,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
             .notes
             .push(format!("{name}: merging alone leaves {merged_count} Gaussians, so it has no smaller points"));
     }
-    let write = |name: &str, text: String| write_text(staged.path(), name, text);
+    let write = |name: &str, text: String| write_text(&staged.path().join(name), text);
     write("sweep.csv", trade_off.csv())?;
     if !trade_off.knobs.is_empty() {
         write("knobs.csv", trade_off.knobs_csv())?;

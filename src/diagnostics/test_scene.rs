@@ -111,7 +111,7 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
     let CompressedScene { mut summary, index_map: map } = compress_scene(&scene, &request)?;
     // The folder is still under its temporary name.
     summary.output.clear();
-    write_text(folder, SUMMARY_FILE, json_text(&summary))?;
+    write_text(&folder.join(SUMMARY_FILE), json_text(&summary))?;
 
     let mut leaders = vec![false; summary.gaussians];
     let bodies = DemoBody::ALL

@@ -281,13 +281,12 @@ impl StagedFolder {
     }
 }
 
-/// Writes `text` to the file `name` in `folder`.
+/// Writes `text` to the file `path`.
 ///
 /// # Errors
 /// Fails if the file cannot be written.
-pub fn write_text(folder: &Path, name: &str, text: impl AsRef<[u8]>) -> Result<()> {
-    let path = folder.join(name);
-    fs::write(&path, text).map_err(Error::io("write", &path))
+pub fn write_text(path: &Path, text: impl AsRef<[u8]>) -> Result<()> {
+    fs::write(path, text).map_err(Error::io("write", path))
 }
 
 /// Writes the JSON object `summary` to the file [`SUMMARY_FILE`] in the output folder `folder`. By this file a later run
@@ -296,7 +295,7 @@ pub fn write_text(folder: &Path, name: &str, text: impl AsRef<[u8]>) -> Result<(
 /// # Errors
 /// Fails if the file cannot be written.
 pub fn write_summary(folder: &Path, summary: &serde_json::Value) -> Result<()> {
-    write_text(folder, SUMMARY_FILE, format!("{summary:#}\n"))
+    write_text(&folder.join(SUMMARY_FILE), format!("{summary:#}\n"))
 }
 
 /// Creates the workspace (hidden folder) in which the output `target` is written. First repairs and removes the

@@ -287,8 +287,8 @@ impl Npz {
     /// header.
     ///
     /// # Errors
-    /// Fails if `take` fails, if it reads all values and their checksum is wrong, or if the file was cut short since it
-    /// was opened.
+    /// Fails if `take` fails, or if the file was cut short since it was opened. If `take` reads all values, also fails
+    /// if their checksum is wrong; otherwise the checksum is not compared.
     pub(crate) fn read(&self, entry: &NpzArray, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
         self.map.check()?;
         let mut archive = open_zip(&self.path)?.map_err(|found| self.damaged(entry, &found))?;

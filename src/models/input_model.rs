@@ -165,8 +165,7 @@ pub trait InputModel: Send + Sync {
 
     /// Returns a note for the user if an output of the kind `kind` leaves out the motion of this model: if it stores
     /// the Gaussians before any motion, although the model has several frames.
-    fn motion_note(&self, kind: OutputKind) -> Option<&'static str> {
-        let _ = kind;
+    fn motion_note(&self, _kind: OutputKind) -> Option<&'static str> {
         None
     }
 

@@ -224,8 +224,8 @@ pub fn write_sequence(
     let percent = 100.0 * visible as f64 / written as f64;
     Ok(Vec::from_iter(is_sparse.then(|| {
         format!(
-            "every frame has all {} Gaussians, of which {percent:.0}% on average are visible; for a container, --link \
-             apart writes only the visible ones of each frame",
+            "every frame has all {} Gaussians, of which {percent:.0}% on average are visible; if the input is a container, \
+             --link apart writes only the visible ones of each frame",
             info.count
         )
     })))

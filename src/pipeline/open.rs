@@ -66,9 +66,9 @@ pub fn open_to_measure(
 ) -> Result<(Scene, RunPlan, Option<Measured>)> {
     let mut start = Stopwatch::start();
     let opened = if options.is_stream() {
+        check(None)?;
         let rig = load_stream_cameras(options)?;
         let stream = open_stream(options)?;
-        check(None)?;
         if !is_linked(stream.header(), options) {
             let (mut scene, stages, measured) = receive_measured(stream, rig, options, plan, journal)?;
             warn_of_virtual_views(&mut scene);
@@ -98,10 +98,10 @@ pub fn open_to_measure(
     Ok((scene, stages, None))
 }
 
-/// Warns the user, at the start and by a note at the end of the run, if Gaussians are ranked and refined for views of
-/// cameras that do not show the whole scene `scene`, because the program placed them.
+/// Warns the user, at the start and by a note at the end of the run, if the program placed the cameras of `scene` and
+/// they may not show all of it. A scene of one frame gets no warning, because its cameras surround it.
 fn warn_of_virtual_views(scene: &mut Scene) {
-    const WARNING: &str = "Gaussians are ranked and refined for virtual views, which costs most of the quality";
+    const WARNING: &str = "Gaussians are ranked by virtual views, which costs most of the quality";
     if !scene.has_cameras {
         scene.events.send(Message::Warning(WARNING));
         scene.notes.insert(0, format!("{WARNING}; give the training cameras with --cameras"));

@@ -130,9 +130,12 @@ impl RunPlan {
             return Ok(low_degree);
         }
         let unrefined = with(MemoryFallback::WithoutRefinement { required_bytes: least(&low_degree) })?;
+        if fits(&unrefined) {
+            return Ok(unrefined);
+        }
         // None fits: the error names the memory of the smallest plan.
-        let smallest = [unrefined, low_degree, constant, full_plan].into_iter().min_by_key(least);
-        smallest.ok_or_else(|| Error::internal("no plan"))
+        let smaller = |a: RunPlan, b: RunPlan| if least(&b) < least(&a) { b } else { a };
+        Ok([low_degree, constant, full_plan].into_iter().fold(unrefined, smaller))
     }
 
     fn empty(measure: MeasureStages, gaussians: usize) -> RunPlan {

@@ -57,6 +57,16 @@ pub enum Quality {
     },
 }
 
+impl Quality {
+    /// Returns the limit, dB: the minimum PSNR or the maximum loss of PSNR.
+    pub fn limit(&self) -> f64 {
+        match self {
+            Quality::Psnr(least) => *least,
+            Quality::Loss { most, .. } => *most,
+        }
+    }
+}
+
 /// Returns `value` if it is a valid number of decibels for a quality: above 0 and at most 100.
 ///
 /// # Errors

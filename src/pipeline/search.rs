@@ -124,7 +124,7 @@ impl SearchStage {
 
     /// Returns the parameters of the search as text for display.
     pub(super) fn parameters(&self) -> String {
-        format!("search: {} sizes at most, for {} {}", MAX_SIZES, self.name(), self.goal())
+        format!("search: {} sizes at most, for {} {}", MAX_SIZES, self.name(), self.searched.limit())
     }
 
     /// Returns the resource estimate (memory, time, reads) of the search. `repeated` holds the estimates of the stages
@@ -265,17 +265,18 @@ impl SearchStage {
 
     /// Returns the cache key of the result of the search: a digest of everything on which the result depends.
     fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, template: &CompressedModel) -> Result<CacheKey> {
-        let (asked, folder) = match &self.searched {
-            Quality::Psnr(least) => (*least, None),
-            Quality::Loss { most, photographs } => (*most, Some(photographs)),
+        let folder = match &self.quality {
+            Quality::Psnr(_) => None,
+            Quality::Loss { photographs, .. } => Some(photographs),
         };
+        let limits = [self.quality.limit(), self.searched.limit()];
         let mut files = Vec::new();
         if let Some(folder) = folder.filter(|_| scene.work.is_enabled()) {
             add_file_stamps(folder, &mut files)?;
         }
         let refine = self.refine.as_ref().map(RefineStage::key);
         Ok(scene.work.key(&(
-            (asked, files, self.target_views, self.fits_photographs, self.before_conversion, self.margins, refine),
+            (limits, files, self.target_views, self.fits_photographs, self.before_conversion, self.margins, refine),
             &scored.protected,
             ranked,
             template,
@@ -397,14 +398,6 @@ impl SearchStage {
         }
     }
 
-    /// Returns the quality limit, dB, that the search must satisfy: the minimum PSNR or the maximum loss of PSNR.
-    fn goal(&self) -> f64 {
-        match self.searched {
-            Quality::Psnr(least) => least,
-            Quality::Loss { most, .. } => most,
-        }
-    }
-
     /// Returns the name of the requested quality in a recipe file: `min_psnr` or `max_loss`.
     fn name(&self) -> &'static str {
         match self.quality {
@@ -414,8 +407,12 @@ impl SearchStage {
     }
 
     fn summary(&self, best: &TriedSize, held: f64, held_views: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
-        let (name, asked, before_conversion) = (self.name().to_owned(), self.goal(), self.before_conversion);
-        let is_met = self.surplus(best.value) >= 0.0;
+        let (name, asked, before_conversion) = (self.name().to_owned(), self.searched.limit(), self.before_conversion);
+        // The aim of an archive is higher than requested. Whether quantization keeps enough, its stage decides.
+        let is_met = match self.quality {
+            Quality::Psnr(least) => best.value >= least,
+            Quality::Loss { .. } => self.surplus(best.value) >= 0.0,
+        };
         GoalSummary { name, is_met, asked, before_conversion, searched: best.value, held, held_views, tried }
     }
 
@@ -436,12 +433,16 @@ impl SearchStage {
             "{searched:.2} dB on the {searched_views} views of the search, {held:.2} dB on {held_count} other views \
              (goal.held_views in the summary){stage}"
         );
-        match is_met {
-            true => format!(
+        match (is_met, self.surplus(*searched) >= 0.0) {
+            (true, true) => format!(
                 "search for {asked}: {gaussians} Gaussians are the smallest of {sizes} tried sizes that reach this; \
                  {measured}"
             ),
-            false => format!(
+            (true, false) => format!(
+                "search for {asked}: none of {sizes} tried sizes leaves room for quantization; all {gaussians} \
+                 Gaussians that may stay are written, with {measured}"
+            ),
+            (false, _) => format!(
                 "{UNREACHED}: none of {sizes} tried sizes has {asked}; all {gaussians} Gaussians that may stay are \
                  written, with {measured}"
             ),

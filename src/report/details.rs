@@ -224,10 +224,10 @@ fn score_histograms(result: &CompressedModelData) -> String {
     let mut out = String::from(
         "<p class=\"note\">Number of Gaussians of the original by value: kept ones at the bottom of each bar, then \
          dropped ones, then those merged into others. Values go by powers of ten, but shares of the frames from none \
-         to all; 0 has no place among powers of ten, and Gaussians at 0 are counted in the legend. Kept and dropped \
-         ones lie apart in values that agree with the selection, and overlap in the others. The recipe says which \
-         values decide: the default ranks by C and W, then by the errors that removals cause in renders, which are \
-         not shown; D, κ (kappa), V and S decide nothing there.</p>\n<div class=\"charts\">\n",
+         to all; 0 has no place among powers of ten, and Gaussians at 0 are counted in the legend. If a value \
+         decides, the bars of kept and dropped ones lie apart; otherwise they overlap. The default recipe ranks by C \
+         and W, then by the error that a removal causes in renders (not shown). It does not use D, κ (kappa), V and \
+         S.</p>\n<div class=\"charts\">\n",
     );
     let mut alike = Vec::new();
     for of in histograms {

@@ -372,7 +372,7 @@ fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFile
     files.extend(turned.map(|of| ("knobs.csv", of.knobs_csv())));
     files.extend(report.precision.as_ref().map(|of| ("precision.csv", of.csv())));
     for (name, text) in files {
-        write_text(staged.path(), name, text)?;
+        write_text(&staged.path().join(name), text)?;
     }
     let summary = serde_json::json!({
         "tool": report.tool,

@@ -175,7 +175,7 @@ fn only_commands_that_rank_warn_of_ranking_by_virtual_views() {
     ] {
         let said = workplace.run(arguments).stderr;
         assert!(said.contains("warning: no cameras were given or found. All views are virtual"), "{said}");
-        assert_eq!(said.contains("ranked and refined for virtual views"), ranks, "{said}");
+        assert_eq!(said.contains("ranked by virtual views"), ranks, "{said}");
     }
 }
 

@@ -303,9 +303,9 @@ fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, not
 
 /// Writes the results `diagram` to `folder`: a CSV table, a JSON file, and the page with the diagrams.
 fn write_files(diagram: &PrecisionDiagram, folder: &Path) -> Result<()> {
-    write_text(folder, "precision.csv", diagram.csv())?;
-    write_text(folder, "precision.json", json_text(diagram))?;
-    write_text(folder, PAGE_FILE, page(diagram))?;
+    write_text(&folder.join("precision.csv"), diagram.csv())?;
+    write_text(&folder.join("precision.json"), json_text(diagram))?;
+    write_text(&folder.join(PAGE_FILE), page(diagram))?;
     write_summary(folder, &serde_json::json!({ "tool": diagram.tool }))
 }
 

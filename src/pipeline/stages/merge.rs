@@ -203,7 +203,7 @@ impl MergeStage {
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, survivors, scene.source(), |_| {
                 // The progress task also covers the computation of the proxies.
-                let progress = scene.events.counting_task(NAME, "sets of survivors");
+                let progress = scene.events.counting_task(NAME, "survivor sets");
                 let mut trial = Trial::new(scene, scored, self, ranking.best_ids(survivors), &progress)?;
                 let mut merged = match self.target {
                     None => trial.merge(&ranking.best_ids(survivors), None)?,

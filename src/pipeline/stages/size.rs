@@ -32,9 +32,11 @@ const MAX_UNUSED: f64 = 0.01;
 /// Maximum number of trials in the search for the number of Gaussians that fits the byte limit. Each trial writes an
 /// output with one number of Gaussians and measures its bytes.
 const MAX_TRIED: usize = 8;
-/// Range of the bytes of a refined result, divided by the byte limit, within which its number of Gaussians is accepted.
+/// Range of the bytes of a refined result, divided by the byte limit, in which its number of Gaussians is accepted. From
+/// 1 to 1.02, a few Gaussians are removed without another refinement, which costs little quality. Below 0.9, more
+/// Gaussians would give clearly better renders.
 const ACCEPTED_BYTES: std::ops::RangeInclusive<f64> = 0.9..=1.02;
-/// Fraction of the byte limit that a repetition of the reduction aims at.
+/// Fraction of the bytes that are left for Gaussians at which a repetition of the reduction aims.
 const REPEATED_AIM: f64 = 0.97;
 /// Maximum number of repetitions of the reduction with another number of Gaussians.
 const MAX_REPEATS: usize = 2;
@@ -117,12 +119,13 @@ impl Stage for ShrinkToBytes {
 fn too_few_bytes(least: u64, most: u64) -> Error {
     Error::usage(format!(
         "--size: expected at least {least} bytes, found {most}\n  {least} bytes is the size of an output with one \
-         Gaussian; nearly all of it is data other than Gaussians, such as a deformation network\n  ask for more bytes"
+         Gaussian; most of it does not depend on the number of Gaussians (file header, deformation network)\n  ask for \
+         more bytes"
     ))
 }
 
-/// Limit on the bytes of the output file, or of all files of the output folder. The files beside it (recipe, index map,
-/// summary) do not count: they are not sent with a model.
+/// Limit on the bytes of the output file, or of the model files in the output folder. Recipe, index map and summary do
+/// not count: no renderer reads them.
 #[derive(Debug, Clone)]
 struct ByteLimit {
     /// Stage that writes the output files; used to measure the size of a result.
@@ -235,8 +238,8 @@ impl ByteLimit {
     /// values compress worse than the values with which the number of Gaussians was found. Gaussians that must stay are
     /// not removed.
     ///
-    /// If the bytes are far from the limit ([`ACCEPTED_BYTES`]) and the reduction may be repeated with up to `most`
-    /// Gaussians, returns `compressed` as it is, and the number of Gaussians for the repetition.
+    /// If the bytes are far from the limit ([`ACCEPTED_BYTES`]) and the reduction may be repeated with up to
+    /// `repeat_up_to` Gaussians, returns `compressed` as it is, and the number of Gaussians for the repetition.
     ///
     /// # Errors
     /// Fails if the Gaussians that must stay do not fit alone, if frames cannot be read, or if a write fails.
@@ -245,24 +248,26 @@ impl ByteLimit {
         scene: &Scene,
         scored: &Scored,
         mut compressed: CompressedModel,
-        most: Option<usize>,
+        repeat_up_to: Option<usize>,
         journal: &mut Journal,
     ) -> Result<(CompressedModel, Option<usize>)> {
-        let key = self.key(scene, &compressed).extended_by(&(&scored.protected, most));
+        let key = self.key(scene, &compressed).extended_by(&(&scored.protected, repeat_up_to));
         journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
             let bytes = |some: &CompressedModel| self.writer.output_bytes(scene, some);
             let empty = bytes(&compressed.pick(&[]))?;
             let (mut tried, protected) = (0, scored.protected.len());
+            let mut found = bytes(&compressed)?;
+            let wanted = repeat_up_to.and_then(|most| {
+                let wanted = self.repeated_count(compressed.len(), found, empty)?;
+                Some(wanted.clamp(protected.max(1).min(most), most))
+            });
+            if let Some(wanted) = wanted.filter(|&wanted| wanted != compressed.len()) {
+                let count = compressed.len();
+                return Ok(((compressed, Some(wanted)), count));
+            }
             loop {
-                let (count, found) = (compressed.len(), bytes(&compressed)?);
-                if let Some(most) = most.filter(|_| tried == 0) {
-                    let next = self.repeated_count(count, found, empty).clamp(protected.max(1).min(most), most);
-                    let is_accepted = ACCEPTED_BYTES.contains(&(found as f64 / self.most.max(1) as f64));
-                    if !is_accepted && next != count {
-                        return Ok(((compressed, Some(next)), count));
-                    }
-                }
                 if found <= self.most {
+                    let count = compressed.len();
                     return Ok(((compressed, None), count));
                 }
                 if compressed.len() <= protected {
@@ -277,15 +282,19 @@ impl ByteLimit {
                 tried += 1;
                 let places = self.best(scene, scored, &compressed, left)?;
                 compressed = compressed.pick(&places);
+                found = bytes(&compressed)?;
             }
         })
     }
 
-    /// Returns the number of Gaussians with which the output is expected to take the fraction [`REPEATED_AIM`] of the
-    /// byte limit, if it takes `found` bytes with `count` Gaussians and `empty` bytes without any.
-    fn repeated_count(&self, count: usize, found: u64, empty: u64) -> usize {
-        let wanted = REPEATED_AIM * self.most as f64 - empty as f64;
-        (wanted / found.saturating_sub(empty).max(1) as f64 * count as f64) as usize
+    /// Returns the number of Gaussians that is expected to use the bytes left for Gaussians, up to the fraction
+    /// [`REPEATED_AIM`]. The output takes `found` bytes with `count` Gaussians and `empty` bytes without any. Returns
+    /// `None` if `found` is accepted, or if the output exceeds the limit even without Gaussians.
+    fn repeated_count(&self, count: usize, found: u64, empty: u64) -> Option<usize> {
+        let room = self.most.checked_sub(empty).filter(|&room| room > 0)?;
+        let is_accepted = ACCEPTED_BYTES.contains(&(found as f64 / self.most as f64));
+        let per_byte = count as f64 / found.saturating_sub(empty).max(1) as f64;
+        (!is_accepted).then_some((REPEATED_AIM * room as f64 * per_byte) as usize)
     }
 
     /// Chooses the `count` Gaussians of `compressed` that stay: those that must stay, then those with the highest

@@ -12,6 +12,7 @@ use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{
     Replace, SUMMARY_FILE, ScratchFolder, StagedFiles, StagedFolder, TargetKind, check_target, check_targets,
+    write_text,
 };
 use crate::files::names::name_of;
 use crate::files::sog::images::morton_order;
@@ -19,7 +20,7 @@ use crate::files::text::json_text;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload, bytes_of_survivors};
-use crate::model::Attributes;
+use crate::model::{Attributes, inverse_permutation};
 use crate::models::{InputModel, ModelSize};
 use crate::outputs::bounds::ErrorBounds;
 use crate::outputs::container::{FRAME_BLOCK, write_container};
@@ -161,8 +162,7 @@ impl Stage for WriteStage {
 /// Adapts the index map `map` (for every input Gaussian its index in the result) to an output file in which the
 /// Gaussians have another order. The Gaussian with index `i` in the file has the index `order[i]` in the result.
 fn reorder(map: &mut [Option<u32>], order: &[u32]) {
-    let mut places = vec![0; order.len()];
-    order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
+    let places = inverse_permutation(order);
     map.iter_mut().flatten().for_each(|place| *place = places[*place as usize]);
 }
 
@@ -332,7 +332,7 @@ impl WriteStage {
             write_text(&staged.path().join(RECIPE_FILE), recipe)?;
             write_index_map(map, &staged.path().join(INDEX_MAP_FILE))?;
             let summary = summarize(staged.path(), journal, size)?;
-            write_text(&staged.path().join(SUMMARY_FILE), &json_text(&summary))?;
+            write_text(&staged.path().join(SUMMARY_FILE), json_text(&summary))?;
             staged.commit()?;
             return Ok(summary);
         }
@@ -342,7 +342,7 @@ impl WriteStage {
         write_text(&recipe_file, recipe)?;
         write_index_map(map, &index_map)?;
         let summary = summarize(staged.path(), journal, size)?;
-        write_text(&marker, &json_text(&summary))?;
+        write_text(&marker, json_text(&summary))?;
         staged.commit()?;
         Ok(summary)
     }
@@ -374,10 +374,6 @@ pub(crate) fn write_within(source: &dyn FrameSource, bounds: ErrorBounds, path: 
     let info = source.info();
     let progress = events.task(NAME, "states", (info.count * info.times.len()) as u64);
     write_container(source, path, bounds::packing(bounds), BTreeMap::new(), |done| progress.advance(done))
-}
-
-fn write_text(path: &Path, text: &str) -> Result<()> {
-    fs::write(path, text).map_err(Error::io("write", path))
 }
 
 #[cfg(test)]
