@@ -71,7 +71,7 @@ pub fn open_to_measure(
         let stream = open_stream(options)?;
         if !is_linked(stream.header(), options) {
             let (mut scene, stages, measured) = receive_measured(stream, rig, options, plan, journal)?;
-            warn_of_virtual_views(&mut scene);
+            warn_of_virtual_views(&scene);
             scene.add_outside_views(stages.measure.scan.recipe.outside);
             journal.record_opening("receive", start, scene.source().info().count, ReadCounts::default());
             return Ok((scene, stages, measured));
@@ -84,7 +84,7 @@ pub fn open_to_measure(
         check(Some(frames.times().len()))?;
     }
     let mut scene = from_input(track::run(opened, options, &mut start, journal)?, options)?;
-    warn_of_virtual_views(&mut scene);
+    warn_of_virtual_views(&scene);
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
     scene.add_outside_views(stages.measure.scan.recipe.outside);
     let plan = MemoryPlan::fit_budget(scene.workload(), options.memory, &options.events, |work, limits| {
@@ -98,13 +98,12 @@ pub fn open_to_measure(
     Ok((scene, stages, None))
 }
 
-/// Warns the user, at the start and by a note at the end of the run, if the program placed the cameras of `scene` and
-/// they may not show all of it. A scene of one frame gets no warning, because its cameras surround it.
-fn warn_of_virtual_views(scene: &mut Scene) {
-    const WARNING: &str = "Gaussians are ranked by virtual views, which costs most of the quality";
+/// Warns the user at the start of the run if the program placed the cameras of `scene` and they may not show all of it.
+/// A scene of one frame gets no warning, because its cameras surround it.
+fn warn_of_virtual_views(scene: &Scene) {
     if !scene.has_cameras {
-        scene.events.send(Message::Warning(WARNING));
-        scene.notes.insert(0, format!("{WARNING}; give the training cameras with --cameras"));
+        let warning = "Gaussians are ranked by virtual views, which costs most of the quality";
+        scene.events.send(Message::Warning(warning));
     }
 }
 
