@@ -96,7 +96,7 @@ def constant_columns(count: int | None, sh_degree: int, constant: Mapping[str, A
 
 
 def as_arrays(columns: Mapping[str, ArrayLike], place: str) -> dict[str, Array]:
-    """Returns the columns as arrays. Raises ValueError, which names `place`, if a name is unknown."""
+    """Returns the columns as arrays. Raises ValueError for an unknown name; `place` begins the message."""
     for name in columns:
         if name not in COLUMNS:
             raise ValueError(f"{place}: no attribute is named {name!r}, expected {', '.join(COLUMNS)}")
@@ -104,7 +104,7 @@ def as_arrays(columns: Mapping[str, ArrayLike], place: str) -> dict[str, Array]:
 
 
 def check_shapes(columns: Mapping[str, Array], count: int | None, sh_degree: int, place: str) -> None:
-    """Raises ValueError, which names `place`, if a column is not that of `count` Gaussians (None: of any number)."""
+    """Raises ValueError if a column does not hold `count` Gaussians (None: any number); `place` begins the message."""
     coefficients = (sh_degree + 1) ** 2
     shapes: dict[str, list[tuple[int, ...]]] = {
         "position": [(3,)],

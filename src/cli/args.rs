@@ -209,7 +209,8 @@ pub(super) struct OutputSize {
     ///
     /// With photographs, a fit to photographs follows the fit to renders and takes about as long. Its result is kept
     /// if it raises the PSNR against photographs of cameras that the fit does not use.
-    #[arg(long, help_heading = HOW_SMALL, value_name = "IMAGES", hide_short_help = true, value_parser = choice(FIT_TARGETS))]
+    #[arg(long, help_heading = HOW_SMALL, value_name = "IMAGES", hide_short_help = true)]
+    #[arg(value_parser = choice(FIT_TARGETS))]
     pub(super) toward: Option<FitTarget>,
 }
 

@@ -18,8 +18,7 @@ use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::camera_path::cameras_along;
 use crate::scene::view_selection::{self, ViewSet, render_background};
-use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
-use crate::scene::{check_compressed, open_compressed};
+use crate::scene::{InputOptions, OpenedInput, check_compressed, from_input, open_compressed, open_input};
 
 /// Name of the rendering stage, for progress.
 const NAME: &str = "render";
@@ -96,11 +95,9 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
     let own = views_with_times(&mut opened, options.input.frames.is_some());
     let mut scene = from_input(opened, &InputOptions { split: None, ..options.input.clone() })?;
-    let mut notes = std::mem::take(&mut scene.notes);
-    let beside = match options.beside.as_deref() {
-        Some(path) => Some(open_compressed(path, &scene, &options.input, &mut notes)?),
-        None => None,
-    };
+    let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
+    let (beside, note) = beside.unzip();
+    scene.notes.extend(note.flatten());
     let models = 1 + u64::from(beside.is_some());
     scene.plan_memory(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
         // Bytes per pixel and model, besides the render: the joined frame (12), its 8-bit values (3) and, for a GIF,
@@ -125,7 +122,7 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     }
     film.finish()?;
     staged.commit()?;
-    Ok(VideoReport { frames: views.len(), size, notes })
+    Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
 }
 
 /// Removes the times from the views (pairs of a camera and a time) of `opened`, so that every camera can show every

@@ -183,9 +183,8 @@ impl ModelPair {
     pub fn open(options: &EvaluateOptions) -> Result<ModelPair> {
         check_compressed(&options.compressed)?;
         let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
-        let mut notes = std::mem::take(&mut scene.notes);
-        let compressed = open_compressed(&options.compressed, &scene, &options.original, &mut notes)?;
-        scene.notes = notes;
+        let (compressed, note) = open_compressed(&options.compressed, &scene, &options.original)?;
+        scene.notes.extend(note);
         let background = render_background(options.background, &scene)?;
         let times = &scene.source().info().times;
         let mut chosen = select_views(&scene.rig, times, options.views)?;

@@ -23,7 +23,7 @@ use zip::{CompressionMethod, ZipArchive};
 use super::pickle::PickleError;
 pub(crate) use super::pickle::{MAX_DEPTH, Node, NodeId, Pickle};
 use super::shared_file::SharedFile;
-use super::zip_directory::declared_directory;
+use super::zip_directory::{checksum_matches, declared_directory};
 use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 
@@ -521,8 +521,7 @@ fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
 }
 
 /// Reads the bytes of the file with index `index` in the zip archive `archive`, which `file` holds. The file in the
-/// archive must be uncompressed. Fails if its bytes do not match its checksum. A checksum of 0 is not compared: PyTorch
-/// writes it if it did not compute one.
+/// archive must be uncompressed. Fails if its bytes do not match its checksum.
 fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
     let (start, size, expected) = {
         let entry = archive.by_index(index)?;
@@ -537,7 +536,7 @@ fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: us
     file.read_exact(&mut bytes)?;
     let mut sum = Crc::new();
     sum.update(&bytes);
-    match expected == 0 || sum.sum() == expected {
+    match checksum_matches(expected, sum.sum()) {
         true => Ok(bytes),
         false => Err(std::io::Error::other("bytes that do not match their checksum")),
     }

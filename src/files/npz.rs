@@ -36,7 +36,8 @@ const SCRATCH_PER_BYTE: u64 = 64;
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
 /// Largest possible ratio of decompressed to compressed bytes with DEFLATE.
 const MAX_DEFLATE_FACTOR: u64 = 1032;
-/// Number of bytes of an array whose checksum is computed before their pages are released from memory.
+/// The checksum of a mapped array is computed in parts of this many bytes. After each part, its pages are released from
+/// memory.
 const CHECKED_BYTES: usize = 1 << 20;
 
 /// Open `.npz` archive.

@@ -65,14 +65,20 @@ pub(crate) fn declared_directory(file: &mut (impl Read + Seek)) -> Result<Declar
     Ok(DeclaredDirectory { entries: number(&record, 32, 8), bytes: len.saturating_sub(start) })
 }
 
+/// Returns whether `found`, the checksum (CRC-32) of the bytes that were read, is the checksum `listed` that the archive
+/// lists. A listed checksum of 0 matches everything: some programs, such as PyTorch, write it if they do not compute
+/// one.
+pub(crate) fn checksum_matches(listed: u32, found: u32) -> bool {
+    listed == 0 || listed == found
+}
+
 /// Checks the checksum (CRC-32) of a file called `name` in the zip archive `path`: `found` is that of the bytes that
-/// were read, `listed` the one that the archive lists. A listed checksum of 0 is not compared: some programs, such as
-/// PyTorch, write it if they do not compute one.
+/// were read, `listed` the one that the archive lists ([`checksum_matches`]).
 ///
 /// # Errors
 /// Fails if the checksums differ, that is, if the bytes are not those that were written.
 pub(crate) fn check_checksum(path: &Path, name: &str, [listed, found]: [u32; 2]) -> crate::error::Result<()> {
-    match listed == 0 || listed == found {
+    match checksum_matches(listed, found) {
         true => Ok(()),
         false => {
             let (expected, found) = (format!("bytes with the checksum {listed:08x}"), format!("{found:08x}"));

@@ -18,6 +18,7 @@ use crate::journal::records::{
     FieldPrecisionSummary, OmittedWork, PhotographSummary, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord,
 };
 use crate::machine::peak_memory_bytes;
+use crate::progress::{Events, Message};
 use crate::scene::Scene;
 use crate::source::{FrameSource, ReadCounts};
 
@@ -80,6 +81,13 @@ pub struct Journal {
 }
 
 impl Journal {
+    /// Shows the warning `text` to the user, and makes it the first note, because a summary may show only its first
+    /// notes.
+    pub fn warn(&mut self, events: &Events, text: String) {
+        events.send(Message::Warning(&text));
+        self.notes.insert(0, text);
+    }
+
     /// Runs the stage `name`, whose work is the function `work`, and returns its result. Records the time, the memory,
     /// and the reads of `source`. `gaussians_in` is the number of Gaussians before the stage. `work` returns its result
     /// together with the number of Gaussians after the stage.

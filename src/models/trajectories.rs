@@ -73,8 +73,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
     }
 }
 
-/// Checks that a sequence of `frames` frames in which every frame is stored can be written as the kind of output `kind`
-/// to `path`.
+/// Checks that a sequence of `frames` stored frames can be written to `path` as an output of the kind `kind`.
 ///
 /// # Errors
 /// Fails if it cannot be written; the message lists kinds of output that work.
@@ -224,8 +223,8 @@ pub fn write_sequence(
     let percent = 100.0 * visible as f64 / written as f64;
     Ok(Vec::from_iter(is_sparse.then(|| {
         format!(
-            "every frame has all {} Gaussians, of which {percent:.0}% on average are visible; if the input is a container, \
-             --link apart writes only the visible ones of each frame",
+            "every frame has all {} Gaussians, of which {percent:.0}% on average are visible; if the input is a \
+             container, --link apart writes only the visible ones of each frame",
             info.count
         )
     })))

@@ -140,14 +140,14 @@ impl PackedFrame {
         };
         add_texture(&mut textures, pixels, &rows, [0.0, 0.0, 0.0, 1.0].map(f32::to_le_bytes), position);
         let rotation = |row: usize| {
-            let q = state.rotation.row::<4>(row).map(f64::from);
+            let q = state.rotation_f64(row);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             let [w, x, y, z] = if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] };
             [z, x, -y, w].map(half_bytes)
         };
         add_texture(&mut textures, pixels, &rows, [0.0, 0.0, 0.0, 1.0].map(half_bytes), rotation);
         let shape = |row: usize| {
-            let [x, y, z] = state.log_scale.row::<3>(row).map(|log| f64::from(log).exp());
+            let [x, y, z] = state.scales_f64(row);
             [z, x, y, opacity(state.opacity_logit.row::<1>(row)[0])].map(half_bytes)
         };
         add_texture(&mut textures, pixels, &rows, [0.0; 4].map(half_bytes), shape);
@@ -278,16 +278,16 @@ mod tests {
             let rows: Vec<usize> = (0..300).filter(|&row| alpha(row) >= MIN_VISIBLE_OPACITY).collect();
             assert_eq!(text["frames"][frame]["gaussianCount"], rows.len());
             for row in rows {
-                let [x, y, z] = state.position.row::<3>(row).map(f64::from);
+                let [x, y, z] = state.position_f64(row);
                 let pixel = places.iter().position(|place| place[..3] == [z, x, -y]).expect("position bit for bit");
-                let [a, b, c] = state.log_scale.row::<3>(row).map(|log| f64::from(log).exp());
+                let [a, b, c] = state.scales_f64(row);
                 let near = |found: [f64; 4], expected: [f64; 4]| {
                     found.iter().zip(expected).all(|(a, b)| (a - b).abs() <= 1e-3 * b.abs().max(0.01))
                 };
                 assert!(near(shapes[pixel], [c, a, b, alpha(row)]), "{:?}", shapes[pixel]);
                 let [r, g, b] = state.sh.row::<3>(row).map(f64::from);
                 assert!(near(colors[pixel], [r, g, b, 0.0]), "{:?}", colors[pixel]);
-                let q = state.rotation.row::<4>(row).map(f64::from);
+                let q = state.rotation_f64(row);
                 let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
                 let [w, x, y, z] = q.map(|x| x / length);
                 assert!(near(turns[pixel], [z, x, -y, w]), "{:?}", turns[pixel]);

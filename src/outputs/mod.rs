@@ -25,7 +25,7 @@ mod tests {
     /// player shows at this frame. Returns `None` if the opacity of the Gaussian is below 0.1.
     pub(super) fn opacities_near(state: &Gaussians, id: usize, shown: &[([f64; 3], f64)]) -> Option<(f64, Vec<f64>)> {
         let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
-        let at = state.position.row::<3>(id).map(f64::from);
+        let at = state.position_f64(id);
         let size = f64::from(state.log_scale.row::<3>(id).iter().copied().fold(f32::MIN, f32::max)).exp();
         let distance = |place: [f64; 3]| (0..3).map(|c| (place[c] - at[c]).powi(2)).sum::<f64>().sqrt() / size;
         let near = shown.iter().filter(|(place, _)| distance(*place) < 0.5).map(|&(_, alpha)| alpha);

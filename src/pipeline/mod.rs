@@ -176,14 +176,13 @@ fn run_stages(
 /// is far from the requested size on disk. Of a reduction that is repeated, only the records of its stages are kept.
 fn reduce(plan: &RunPlan, run: &mut RunState<'_>) -> Result<()> {
     loop {
-        let before = [run.journal.left_out.len(), run.journal.notes.len()];
-        run.must_repeat = false;
+        let (repeats, left_out, notes) = (run.repeats, run.journal.left_out.len(), run.journal.notes.len());
         plan.stages.run(Phase::Reduce, run)?;
-        if !run.must_repeat {
+        if run.repeats == repeats {
             return Ok(());
         }
-        run.journal.left_out.truncate(before[0]);
-        run.journal.notes.truncate(before[1]);
+        run.journal.left_out.truncate(left_out);
+        run.journal.notes.truncate(notes);
         (run.journal.field, run.journal.bands) = (None, None);
         (run.journal.refined, run.journal.photographs) = (None, None);
     }

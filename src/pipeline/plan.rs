@@ -55,8 +55,7 @@ impl RunPlan {
     /// output of this plan is valid: the number of Gaussians is not known. `frames`: number of frames, if known.
     ///
     /// # Errors
-    /// Fails in the cases in which [`RunPlan::new`] fails, as far as they can be found without the number of Gaussians.
-    /// Also fails if the kind of output cannot store a sequence of `frames` frames.
+    /// Fails like [`RunPlan::new`], except for errors that depend on the number of Gaussians. Also fails if the kind of output cannot store a sequence of `frames` frames.
     pub fn before_reading(request: &Request, frames: Option<usize>) -> Result<RunPlan> {
         [&request.keep_ids, &request.drop_ids].into_iter().flatten().try_for_each(|ids| check_ids(ids))?;
         let named = Request { keep_ids: None, drop_ids: None, ..request.clone() };

@@ -27,7 +27,6 @@ use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GA
 use crate::metrics::PSNR_CAP_DB;
 use crate::model::{Attributes, FrameView};
 use crate::outputs::kind::{Fidelity, OutputKind};
-use crate::progress::Message;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::prune_steps::PrunedModels;
@@ -210,19 +209,16 @@ impl SearchStage {
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             (journal.refined, journal.photographs) = (best.journal.refined, best.journal.photographs);
-            journal.notes.push(self.note(&summary, meter.search_view_count(), count));
-            Ok(((best.result, AsToml(summary)), count))
+            let note = self.note(&summary, meter.search_view_count(), count);
+            Ok(((best.result, AsToml(summary), note), count))
         });
-        let (result, AsToml(mut goal)) = found?;
+        let (result, AsToml(mut goal), note) = found?;
         if let Quality::Psnr(least) = self.quality {
             goal.asked = least;
         }
-        let notes = &mut run.journal.notes;
-        if let Some(at) = notes.iter().rposition(|note| note.starts_with(UNREACHED)).filter(|_| !goal.is_met) {
-            // The summary shows only its first notes.
-            let note = notes.remove(at);
-            scene.events.send(Message::Warning(&note));
-            notes.insert(0, note);
+        match goal.is_met {
+            true => run.journal.notes.push(note),
+            false => run.journal.warn(&scene.events, note),
         }
         (run.result, run.goal) = (result, Some(goal));
         Ok(())

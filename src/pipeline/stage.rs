@@ -371,9 +371,7 @@ pub struct RunState<'a> {
     pub template: CompressedModel,
     /// Compressed model in the state in which the last stage left it.
     pub result: CompressedModel,
-    /// Whether the reduction ([`Phase::Reduce`]) has to be repeated with the present target.
-    pub must_repeat: bool,
-    /// Number of repetitions of the reduction so far.
+    /// Number of repetitions of the reduction ([`Phase::Reduce`]) that stages have asked for so far.
     pub repeats: usize,
     /// Number of Gaussians that refinement is to leave in the model [`result`](RunState::result).
     pub refine_to: usize,
@@ -418,7 +416,6 @@ impl<'a> RunState<'a> {
             counts_within_bytes: Vec::new(),
             result: template.clone(),
             template,
-            must_repeat: false,
             repeats: 0,
             refine_to: 0,
             prune_steps: None,

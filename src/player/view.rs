@@ -15,8 +15,7 @@ use crate::player::quantization::{PlayerSteps, component_count};
 use crate::player::track::{MAX_VALUES_PER_FRAME_GROUP, PageSequence, encode};
 use crate::progress::Events;
 use crate::scene::view_selection::render_background;
-use crate::scene::{InputOptions, first_frame_box, open_scene, scratch_beside};
-use crate::scene::{check_compressed, open_compressed};
+use crate::scene::{InputOptions, check_compressed, first_frame_box, open_compressed, open_scene, scratch_beside};
 
 /// Name of the stage that writes the page, for progress messages and the memory plan.
 const NAME: &str = "view";
@@ -106,11 +105,10 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     if scene.source().info().times.is_empty() {
         return Err(Error::input(&options.original.path, "", "at least one frame to show", "none"));
     }
-    let mut notes = std::mem::take(&mut scene.notes);
-    let compressed = match options.compressed.as_deref() {
-        Some(path) => Some(open_compressed(path, &scene, &options.original, &mut notes)?),
-        None => None,
-    };
+    let compressed =
+        options.compressed.as_deref().map(|path| open_compressed(path, &scene, &options.original)).transpose()?;
+    let (compressed, note) = compressed.unzip();
+    scene.notes.extend(note.flatten());
     let background = render_background(options.background, &scene)?;
     let limits = {
         let most = compressed.as_ref().map_or(0, |model| model.source().info().count as u64);
@@ -132,7 +130,7 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
         None => (all, NO_SH_LIMIT),
     };
     let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
-    let mut chunks = ChunkFiles::new(&scratch)?;
+    let (mut chunks, mut notes) = (ChunkFiles::new(&scratch)?, std::mem::take(&mut scene.notes));
     let times = &scene.source().info().times;
     let asked = ModelView { role: "original", path: &scene.path, times, frames, degree };
     let mut models = vec![add_model(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];

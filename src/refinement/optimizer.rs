@@ -184,6 +184,7 @@ fn position_rates(start: &Gaussians) -> Vec<f32> {
     let mut sorted = scales.clone();
     sorted.sort_unstable_by(f32::total_cmp);
     let largest = MAX_SCALE_RATIO * sorted.get(sorted.len() / 2).copied().unwrap_or_default();
+    // A comparison keeps a NaN, which `min` would replace: such a Gaussian does not move.
     scales.into_iter().map(|scale| POSITION_RATE * if scale > largest { largest } else { scale }).collect()
 }
 

@@ -1,8 +1,9 @@
 //! Choice of the renders that the page shows, and their images.
 //!
 //! Input: first the quality measures of all renders, from which some renders are chosen; then the chosen renders, which
-//! the caller renders a second time. Output: PNG files as data URIs. A page has at most four
-//! renders of at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
+//! the caller renders a second time. Output: PNG files as data URIs. A page has at most four renders (the worst one, the
+//! worst one of the worst view, the worst one of the worst frame, and the median one) of at most [`MAX_PIXELS`] pixels,
+//! with three or four images of each: at most 5 MB per result.
 
 use std::io;
 

@@ -31,7 +31,7 @@ pub fn check_compressed(path: &Path) -> Result<()> {
 /// options with which the original was opened; the training iteration in them is ignored.
 ///
 /// A `.splatv` file that was made from frames with times outside the range from 0 to 1 stores these times scaled to
-/// this range. Such a model is opened at the scaled times, and a note that says so is added to `notes`.
+/// this range. Such a model is opened at the scaled times; the second result is then a note for the user that says so.
 ///
 /// # Errors
 /// Fails if the model cannot be read, or if the number or the times of its frames differ from the original's.
@@ -39,20 +39,20 @@ pub fn open_compressed(
     path: &Path,
     original: &Scene,
     options: &InputOptions,
-    notes: &mut Vec<String>,
-) -> Result<Box<dyn InputModel>> {
+) -> Result<(Box<dyn InputModel>, Option<String>)> {
     let own_times = &original.source().info().times;
     let input = models::open(path, &OpenOptions { iteration: None, ..options.open_options() })?.into_linked()?;
     let is_fitted_splatv =
         input.default_output_kind() == OutputKind::Splatv && !original.input.keeps_motion(OutputKind::Splatv);
     let times = &if is_fitted_splatv { scale_to_unit(own_times) } else { own_times.clone() };
-    if let ([first, .., last], true) = (&own_times[..], times != own_times) {
-        notes.push(format!(
+    let note = match &own_times[..] {
+        [first, .., last] if times != own_times => Some(format!(
             "the times of the original, {first} to {last}, are compared with the times 0 to 1 of {}, because a .splatv \
              holds no other times",
             path.shown()
-        ));
-    }
+        )),
+        _ => None,
+    };
     let input = match input.timing() {
         TimeOrigin::Continuous => input.with_times(times.clone())?,
         TimeOrigin::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,
@@ -73,7 +73,7 @@ pub fn open_compressed(
             Err(Error::input(path, format!("frame {frame}"), expected, found[frame].to_string())
                 .hint("compare models of the same scene, with the cameras both were made for"))
         }
-        None => Ok(input),
+        None => Ok((input, note)),
     }
 }
 

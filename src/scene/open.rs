@@ -182,8 +182,7 @@ const MAX_FRAMES: usize = 1_000_000;
 /// Memory: 64 bytes per Gaussian.
 fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
     let state = gather_all(source, 0, Attributes::POSITION | Attributes::LOG_SCALE | Attributes::OPACITY)?;
-    let positions: Vec<DVec3> =
-        (0..state.len()).map(|i| DVec3::from_array(state.position.row::<3>(i).map(f64::from))).collect();
+    let positions: Vec<DVec3> = (0..state.len()).map(|i| DVec3::from_array(state.position_f64(i))).collect();
     let visible_area = |i: usize| {
         let mut scales = state.log_scale.row::<3>(i).map(f64::from);
         scales.sort_by(f64::total_cmp);

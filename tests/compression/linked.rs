@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::Instant;
 
+use crate::frame_streams::unlinked_stream;
 use crate::scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
 use splatsieve::model::Gaussians;
 use splatsieve::model::hash_id;
@@ -517,28 +518,6 @@ fn shuffled_frames_of_trained_models_are_relinked() {
     }
 }
 
-/// Returns a stream of version 2 (format/STREAM.md) with the frames `frames` at evenly spaced times.
-fn stream(frames: &[Gaussians]) -> Vec<u8> {
-    let mut bytes = b"\x89GSTR\r\n\x1a".to_vec();
-    for field in [2, 1, 0, 0, 31, 0] {
-        bytes.extend(u32::to_le_bytes(field));
-    }
-    for (number, frame) in (0u32..).zip(frames) {
-        let columns = [&frame.position, &frame.rotation, &frame.log_scale, &frame.opacity_logit, &frame.sh];
-        let values: Vec<u8> =
-            columns.iter().flat_map(|column| column.planes()).flat_map(|value| value.to_le_bytes()).collect();
-        bytes.extend(b"FRAM");
-        bytes.extend(number.to_le_bytes());
-        bytes.extend((f64::from(number) / frames.len() as f64).to_le_bytes());
-        bytes.extend((values.len() as u64).to_le_bytes());
-        bytes.extend(values);
-    }
-    bytes.extend(b"DONE");
-    bytes.extend((frames.len() as u32).to_le_bytes());
-    bytes.extend([0; 16]);
-    bytes
-}
-
 #[test]
 fn stream_of_unlinked_frames_gives_the_bytes_of_files() {
     let workplace = Workplace::new();
@@ -546,7 +525,7 @@ fn stream_of_unlinked_frames_gives_the_bytes_of_files() {
     for (t, frame) in frames.iter().enumerate() {
         workplace.ply(&format!("frames/frame_{t:05}.ply"), frame);
     }
-    let bytes = stream(&frames);
+    let bytes = unlinked_stream(1, &frames);
     let run = |arguments: &str| {
         let output = workplace.piped(arguments, &bytes);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -620,13 +599,13 @@ fn lives_in_containers_and_streams_join_on_request() {
 fn cut_or_empty_stream_leaves_no_files() {
     let workplace = Workplace::new();
     let frames: Vec<Gaussians> = (0..3).map(|t| frame(50, t, |_| true).0).collect();
-    let whole = stream(&frames);
+    let whole = unlinked_stream(1, &frames);
     let mut odd = whole.clone();
     odd[32 + 16..][..8].copy_from_slice(&(4u64 * 24 + 1).to_le_bytes());
     for (bytes, part) in [
         (&whole[..whole.len() - 30], "the rest of frame 2 (column sh)"),
         (&whole[..whole.len() - 24], "after 3 complete frames"),
-        (&stream(&[])[..], "at least one frame"),
+        (&unlinked_stream(1, &[])[..], "at least one frame"),
         (&odd[..], "frame 0, byte 48"),
     ] {
         for verb in ["convert - out.gseq --scratch-dir .", "compress - -o out.gseq --scratch-dir . --ratio 0.5"] {

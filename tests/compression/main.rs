@@ -5,6 +5,7 @@ mod bands;
 mod bounded;
 mod compress;
 mod families;
+mod frame_streams;
 mod goals;
 mod half_field;
 mod linked;

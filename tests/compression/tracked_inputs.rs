@@ -3,36 +3,9 @@
 
 use std::fs;
 
+use crate::frame_streams::{stream_header, unlinked_stream};
 use crate::scene::{Workplace, stderr_text};
 use splatsieve::model::{Gaussians, hash_id};
-
-/// Header of a stream: version, SH degree 0, `count` Gaussians, all attributes with every frame.
-fn header(version: u32, count: u32) -> Vec<u8> {
-    let mut bytes = b"\x89GSTR\r\n\x1a".to_vec();
-    for field in [version, 0, count, 0, 31, 0] {
-        bytes.extend(u32::to_le_bytes(field));
-    }
-    bytes
-}
-
-/// Returns a stream of version 2 of the frames `frames`, of SH degree 0.
-fn stream(frames: &[Gaussians]) -> Vec<u8> {
-    let mut bytes = header(2, 0);
-    for (number, frame) in (0u32..).zip(frames) {
-        let columns = [&frame.position, &frame.rotation, &frame.log_scale, &frame.opacity_logit, &frame.sh];
-        let values: Vec<u8> =
-            columns.iter().flat_map(|column| column.planes()).flat_map(|value| value.to_le_bytes()).collect();
-        bytes.extend(b"FRAM");
-        bytes.extend(number.to_le_bytes());
-        bytes.extend((f64::from(number) / frames.len() as f64).to_le_bytes());
-        bytes.extend((values.len() as u64).to_le_bytes());
-        bytes.extend(values);
-    }
-    bytes.extend(b"DONE");
-    bytes.extend((frames.len() as u32).to_le_bytes());
-    bytes.extend([0; 16]);
-    bytes
-}
 
 /// Returns `count` Gaussians of SH degree 0 at frame `frame`. Their order differs from frame to frame, and their colors
 /// change slightly.
@@ -56,7 +29,9 @@ fn request_is_checked_before_a_stream_is_received() {
     let workplace = Workplace::new();
     fs::write(workplace.path("exists.gseq"), "old").unwrap();
     // Nothing follows the header: reading the first frame would fail.
-    for (bytes, link) in [(header(2, 0), "auto"), (header(1, 5), "always"), (header(1, 5), "auto")] {
+    for (bytes, link) in
+        [(stream_header(2, 0, 0), "auto"), (stream_header(1, 0, 5), "always"), (stream_header(1, 0, 5), "auto")]
+    {
         for (arguments, part) in [
             ("-o exists.gseq", "--overwrite"),
             ("-o out.zip", "does not write .zip files"),
@@ -72,7 +47,7 @@ fn request_is_checked_before_a_stream_is_received() {
             assert!(!output.status.success() && said.contains(part), "{arguments}: {said}");
         }
     }
-    let output = workplace.piped("evaluate - none.gseq", &header(2, 0));
+    let output = workplace.piped("evaluate - none.gseq", &stream_header(2, 0, 0));
     assert!(stderr_text(&output).contains("none.gseq"), "{}", stderr_text(&output));
     workplace.refused(2, "evaluate {tiny} -", &["only the original can be a stream"]);
 }
@@ -81,25 +56,25 @@ fn request_is_checked_before_a_stream_is_received() {
 fn stream_that_is_not_linked_needs_equal_frames() {
     let workplace = Workplace::new();
     let frames: Vec<Gaussians> = (0..4).map(|t| frame(40, t)).collect();
-    let output = workplace.piped("convert - same.gseq --link never", &stream(&frames));
+    let output = workplace.piped("convert - same.gseq --link never", &unlinked_stream(0, &frames));
     assert!(output.status.success(), "{}", stderr_text(&output));
     let said = workplace.done("info same.gseq");
     assert!(said.contains("40 Gaussians") || said.contains("40"), "{said}");
     let frames = [frame(40, 0), frame(40, 1), frame(39, 2)];
     for command in ["convert - out.gseq", "compress - -o out.gseq"] {
-        let output = workplace.piped(&format!("{command} --link never"), &stream(&frames));
+        let output = workplace.piped(&format!("{command} --link never"), &unlinked_stream(0, &frames));
         let said = stderr_text(&output);
         let parts = ["standard input, frame 2", "40 Gaussians, as in frame 0", "39 Gaussians", "--link"];
         assert!(!output.status.success() && parts.iter().all(|part| said.contains(part)), "{said}");
     }
-    let empty = workplace.piped("convert - out.gseq --link never", &stream(&[]));
+    let empty = workplace.piped("convert - out.gseq --link never", &unlinked_stream(0, &[]));
     assert!(stderr_text(&empty).contains("at least one frame"));
 }
 
 #[test]
 fn stream_without_frames_is_refused() {
     let workplace = Workplace::new();
-    let mut bytes = header(1, 5);
+    let mut bytes = stream_header(1, 0, 5);
     bytes.extend(b"DONE");
     bytes.extend([0; 20]);
     let output = workplace.piped("convert - out.gseq", &bytes);
@@ -112,7 +87,7 @@ fn errors_of_values_name_standard_input() {
     let workplace = Workplace::new();
     let mut bad = frame(40, 0);
     (0..20).for_each(|i| bad.position.set_row(i, [f32::NAN; 3]));
-    let output = workplace.piped("compress - -o out.gseq --link never", &stream(&[bad, frame(40, 1)]));
+    let output = workplace.piped("compress - -o out.gseq --link never", &unlinked_stream(0, &[bad, frame(40, 1)]));
     assert!(stderr_text(&output).contains("standard input, Gaussian 0"), "{}", stderr_text(&output));
 }
 

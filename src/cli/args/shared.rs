@@ -48,12 +48,7 @@ pub(in crate::cli) struct Trained {
     pub(in crate::cli) time_duration: Option<f64>,
     /// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint. unflipped: trained with code from before 15
     /// September 2024 [default: flipped]
-    #[arg(
-        long = "rot4d",
-        value_name = "HOW",
-        hide_short_help = true,
-        value_parser = choice(ROTATION_LAYOUTS)
-    )]
+    #[arg(long = "rot4d", value_name = "HOW", hide_short_help = true, value_parser = choice(ROTATION_LAYOUTS))]
     pub(in crate::cli) rot4d_unflipped: Option<bool>,
     /// Handling of Gaussians of a .splatv or .ftgs.ply whose quaternion is zero; players do not draw them [default:
     /// drop]

@@ -143,8 +143,10 @@ impl<R: Read> FrameStream<R> {
         };
         if self.has_common_indices && count != self.header.count {
             let expected = format!("{} Gaussians, as in frame 0", self.header.count);
-            return Err(Error::input(&self.bytes.name, length_place, expected, format!("{count} Gaussians"))
-                .hint("with --link never, every frame must hold the same Gaussians in the same order; leave it out to link frames"));
+            return Err(Error::input(&self.bytes.name, length_place, expected, format!("{count} Gaussians")).hint(
+                "with --link never, every frame must hold the same Gaussians in the same order; leave it out to \
+                     link frames",
+            ));
         }
         for column in self.header.varying.iter() {
             if !self.bytes.read_attribute(count, out.attribute_values_mut(column))? {

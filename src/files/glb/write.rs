@@ -111,7 +111,7 @@ fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
         let [w, x, y, z] = if length > 0.0 { q.map(|x| (x / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
         [-x, -y, z, w]
     };
-    let scale = move |row| state.log_scale.row::<3>(row).map(|log| f64::from(log).exp() as f32);
+    let scale = move |row| state.scales_f64(row).map(|scale| scale as f32);
     let mut all = vec![
         floats("POSITION".to_owned(), "VEC3", move |row| reversed(state.position.row::<3>(row))),
         floats(of_extension("ROTATION"), "VEC4", rotation),

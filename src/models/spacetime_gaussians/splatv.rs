@@ -120,7 +120,7 @@ fn to_row(raw: &StoredParams, i: usize) -> SplatvGaussian {
         motion: std::array::from_fn(|k| own(MOTION + k)),
         rotation: raw.gaussians.rotation.row(i),
         omega: std::array::from_fn(|k| own(OMEGA + k)),
-        scale: raw.gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).exp() as f32),
+        scale: raw.gaussians.scales_f64(i).map(|scale| scale as f32),
         rgb: raw.gaussians.sh.row::<3>(i).map(color_from_sh),
         opacity: opacity(raw.gaussians.opacity_logit.row::<1>(i)[0]),
         center: own(CENTER),

@@ -32,7 +32,6 @@ use crate::pipeline::stages::reference_views::{
     OCTAVE_HALVINGS, QualityTarget, ReferenceViews, check_measurable, check_met, view_count,
 };
 use crate::pipeline::summary::{ArchiveSummary, UNREACHED};
-use crate::progress::Message;
 use crate::refinement::RefineStage;
 use crate::render;
 use crate::scene::Scene;
@@ -111,10 +110,7 @@ impl Stage for ArchiveStage {
             );
             if goal.is_met && goal.searched < goal.asked - MAX_MISSED_PSNR {
                 goal.is_met = false;
-                let note = format!("{UNREACHED}: {text}");
-                run.scene.events.send(Message::Warning(&note));
-                // The summary shows only its first notes.
-                run.journal.notes.insert(0, note);
+                run.journal.warn(&run.scene.events, format!("{UNREACHED}: {text}"));
             } else {
                 run.journal.notes.push(format!("archive: {text}"));
             }

@@ -31,7 +31,6 @@ use crate::outputs::kind::{Fidelity, OutputKind};
 use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
-use crate::progress::Message;
 use crate::pruning::score::scored_memory;
 use crate::scene::view_selection::{self, ViewSet, blind_views_note, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
@@ -169,8 +168,8 @@ impl QualityStage {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let copy = folder.path().join(format!("result.{ending}"));
         fs::copy(path, &copy).map_err(Error::io("copy", path))?;
-        // The path of the copy, which the notes name, means nothing to the user.
-        let output = open_compressed(&copy, scene, &self.input, &mut Vec::new())?;
+        // The note names the copy, which the user does not know.
+        let (output, _) = open_compressed(&copy, scene, &self.input)?;
         Ok(Some((folder, output)))
     }
 
@@ -236,7 +235,7 @@ impl QualityStage {
                 folder = ScratchFolder::new(&scene.scratch)?;
                 let path = folder.path().join("result.gsz");
                 fs::write(&path, &encoded.bytes).map_err(Error::io("write", &path))?;
-                opened = open_compressed(&path, scene, &self.input, &mut Vec::new())?;
+                (opened, _) = open_compressed(&path, scene, &self.input)?;
                 opened.source()
             }
             // Frames with error bounds exist only once they are written.
@@ -252,8 +251,7 @@ impl QualityStage {
         }
         let (psnr, ssim) = mean_scores(scene, result, &views)?;
         if let Some(warning) = blind_views_note(scene, &views, scene.background, psnr)? {
-            scene.events.send(Message::Warning(warning));
-            journal.notes.insert(0, warning.to_owned());
+            journal.warn(&scene.events, warning.to_owned());
             return Ok(None);
         }
         let views = views.len();

@@ -103,12 +103,12 @@ impl Stage for ShrinkToBytes {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, result) = (run.scored()?, run.take_result());
-        let most = (self.repeats && run.repeats < MAX_REPEATS).then(|| scored.selection.ranking.order().len());
-        let (result, next) = self.limit.shrink(run.scene, &scored, result, most, &mut run.journal)?;
+        let may_repeat = self.repeats && run.repeats < MAX_REPEATS;
+        let repeat_up_to = may_repeat.then(|| scored.selection.ranking.order().len());
+        let (result, next) = self.limit.shrink(run.scene, &scored, result, repeat_up_to, &mut run.journal)?;
         run.result = result;
-        if let Some(next) = next {
-            run.repeats += 1;
-            (run.target, run.must_repeat) = (Some(next), true);
+        if next.is_some() {
+            (run.target, run.repeats) = (next, run.repeats + 1);
         }
         Ok(())
     }
@@ -257,13 +257,13 @@ impl ByteLimit {
             let empty = bytes(&compressed.pick(&[]))?;
             let (mut tried, protected) = (0, scored.protected.len());
             let mut found = bytes(&compressed)?;
-            let wanted = repeat_up_to.and_then(|most| {
-                let wanted = self.repeated_count(compressed.len(), found, empty)?;
+            let count = compressed.len();
+            let next = repeat_up_to.and_then(|most| {
+                let wanted = self.repeated_count(count, found, empty)?;
                 Some(wanted.clamp(protected.max(1).min(most), most))
             });
-            if let Some(wanted) = wanted.filter(|&wanted| wanted != compressed.len()) {
-                let count = compressed.len();
-                return Ok(((compressed, Some(wanted)), count));
+            if next.is_some_and(|next| next != count) {
+                return Ok(((compressed, next), count));
             }
             loop {
                 if found <= self.most {
