@@ -9,9 +9,12 @@ use crate::metrics::{BYTES_PER_PIXEL, SSIM_SLOPE_BYTES_PER_PIXEL, decibels, ssim
 use crate::passes::pixel_stride;
 use crate::render::Image;
 
-/// Weight of the newest step in the running mean square of derivatives (see [`limit_slope`]). The earlier mean has the
-/// rest of 1.
-const NEWEST_WEIGHT: f64 = 0.1;
+/// Root mean square of the derivatives of the loss of a view after [`equalize_slope`]: that of a view with 40 dB before
+/// it. Any value serves, because Adam does not depend on a constant factor.
+const VIEW_SLOPE: f64 = 0.02;
+/// Minimum root mean square of derivatives that [`equalize_slope`] scales to [`VIEW_SLOPE`]: that of a view with 90 dB.
+/// Smaller errors are rounding errors.
+const MIN_SLOPE: f64 = 6.3e-5;
 
 /// Factor of the mean square error in the loss. It is chosen so that the squared error and 1 − SSIM contribute about
 /// equally to the loss of renders with 35 dB, if both have the weight 0.5.
@@ -116,26 +119,17 @@ fn image(render: &Image, target: &[u16]) -> Image {
     Image { data: target.iter().copied().map(wide).collect(), ..*render }
 }
 
-/// Limits the derivatives `slope` of the loss of a guard view ([`Targets::is_guard`]) with respect to its color values.
-/// If their root mean square is above the root of `mean_square`, they are scaled down to it; if there is no mean yet, to
-/// 0. Without the limit, the large errors of guard views would raise the gradient magnitudes by which Adam divides, and
-/// so shorten later steps. The derivatives of any other view stay as they are, and their mean square updates
-/// `mean_square`. Values that are not finite do not count: the renderer ignores their pixels.
-pub(super) fn limit_slope(slope: &mut Image, is_guard: bool, mean_square: &mut Option<f64>) {
+/// Scales the derivatives `slope` of the loss of one view with respect to its color values so that their root mean
+/// square is [`VIEW_SLOPE`]. This makes the loss of a view the root of its mean square error, instead of the mean square
+/// error: views with small errors count as much as views with large errors, of which those from outside the rig are an
+/// example. Derivatives whose root mean square is below [`MIN_SLOPE`] stay small. Values that are not finite do not
+/// count: the renderer ignores their pixels.
+pub(super) fn equalize_slope(slope: &mut Image) {
     let squares = slope.data.iter().map(|&value| f64::from(value).powi(2)).filter(|square| square.is_finite());
     let (sum, count) = squares.fold((0.0, 0u32), |(sum, count), square| (sum + square, count + 1));
-    if count == 0 {
-        return;
-    }
-    let own = sum / f64::from(count);
-    match *mean_square {
-        mean if is_guard => {
-            let factor = (mean.unwrap_or(0.0) / own.max(f64::MIN_POSITIVE)).sqrt().min(1.0) as f32;
-            slope.data.iter_mut().for_each(|value| *value *= factor);
-        }
-        Some(mean) => *mean_square = Some(mean + NEWEST_WEIGHT * (own - mean)),
-        None => *mean_square = Some(own),
-    }
+    let root = (sum / f64::from(count.max(1))).sqrt();
+    let factor = (VIEW_SLOPE / root.max(MIN_SLOPE)) as f32;
+    slope.data.iter_mut().for_each(|value| *value *= factor);
 }
 
 #[cfg(test)]
@@ -193,27 +187,27 @@ mod tests {
     }
 
     #[test]
-    fn guard_views_pull_no_harder_than_other_views() {
-        let image = |value: f32| Image { width: 2, height: 1, data: vec![value, -value, 0.0, value, -value, 0.0] };
-        let limited = |value: f32, is_guard: bool, mean: &mut Option<f64>| {
-            let mut slope = image(value);
-            limit_slope(&mut slope, is_guard, mean);
-            slope.data[0]
+    fn every_view_has_equally_large_slopes() {
+        let root = |slope: &Image| {
+            let finite = slope.data.iter().filter(|value| value.is_finite());
+            let (sum, count) = finite.fold((0.0, 0.0), |(sum, count), &v| (sum + f64::from(v).powi(2), count + 1.0));
+            (sum / count).sqrt()
         };
-        let mut mean = None;
-        assert_eq!((limited(0.5, true, &mut mean), mean), (0.0, None));
-        assert_eq!(limited(0.1, false, &mut mean), 0.1);
-        assert!((mean.unwrap() - 2.0 / 3.0 * 0.01).abs() < 1e-9);
-        assert!((limited(0.5, true, &mut mean) - 0.1).abs() < 1e-6, "scaled to the mean");
-        assert_eq!(limited(0.05, true, &mut mean), 0.05, "never scaled up");
-        let before = mean.unwrap();
-        limited(0.2, false, &mut mean);
-        assert!((mean.unwrap() - (before + 0.1 * (2.0 / 3.0 * 0.04 - before))).abs() < 1e-9);
-        let before = mean;
-        let mut odd = image(f32::NAN);
-        limit_slope(&mut odd, false, &mut mean);
-        assert!(mean.unwrap() < before.unwrap(), "NaN is left out, and zeros lower the mean");
-        limit_slope(&mut Image { width: 0, height: 0, data: Vec::new() }, false, &mut mean);
-        assert!(mean.unwrap() > 0.0);
+        let equalized = |values: [f32; 6]| {
+            let mut slope = Image { width: 2, height: 1, data: values.to_vec() };
+            equalize_slope(&mut slope);
+            slope
+        };
+        for scale in [1e-3, 0.02, 0.5, 1e4] {
+            let slope = equalized([1.0, -2.0, 0.0, 0.5, 0.25, -1.0].map(|value| value * scale));
+            assert!((root(&slope) - VIEW_SLOPE).abs() < 1e-7, "{scale}");
+            assert!((slope.data[1] / slope.data[0] + 2.0).abs() < 1e-5, "{scale}: ratios stay");
+        }
+        let noise = equalized([1e-6; 6]);
+        assert!(noise.data[0] < 1e-3, "rounding errors are not scaled to the errors of a view");
+        assert!(equalized([0.0; 6]).data.iter().all(|&value| value == 0.0));
+        let odd = equalized([f32::NAN, 0.1, -0.1, 0.1, -0.1, f32::INFINITY]);
+        assert!((root(&odd) - VIEW_SLOPE).abs() < 1e-7 && odd.data[0].is_nan());
+        equalize_slope(&mut Image { width: 0, height: 0, data: Vec::new() });
     }
 }

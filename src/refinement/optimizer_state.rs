@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
-use super::loss::{Loss, RenderQuality, limit_slope};
+use super::loss::{Loss, RenderQuality, equalize_slope};
 use super::rounding::Rounding;
 use super::step_input::{StepFiles, StepInput};
 use super::targets::Targets;
@@ -95,9 +95,6 @@ pub(super) struct OptimizerState<'a> {
     /// Stride n of the training views: only every n-th column and row of pixels is rendered in optimization steps and
     /// for the ranking of a prune step.
     stride: NonZeroU32,
-    /// Running mean square of the derivatives of the loss with respect to color values ([`Loss::slope`]), over the
-    /// optimization steps on views that are not guard views ([`Targets::is_guard`]). `None` before the first such step.
-    mean_square_slope: Option<f64>,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
     /// Whether the frame states were evaluated again after `constant_optimizer` (optimizer of the stored parameters)
@@ -115,8 +112,6 @@ pub(super) struct OptimizerCheckpoint<Stored, Added, Means> {
     constant_optimizer: (Added, Means, usize),
     /// Number of steps since the frame states were evaluated.
     steps: usize,
-    /// Running mean square of the derivatives with respect to color values.
-    mean_square_slope: Option<f64>,
     /// Delta, running means and step number of the optimizer of each keyframe.
     keyframe_optimizers: Vec<(Added, Means, usize)>,
 }
@@ -160,7 +155,6 @@ impl<'a> OptimizerState<'a> {
             prefetched: None,
             renderer: Renderer::on_all_threads(),
             stride: targets.stride(),
-            mean_square_slope: None,
             steps: 0,
             reevaluated: false,
             frames,
@@ -302,7 +296,6 @@ impl<'a> OptimizerState<'a> {
             reevaluated: self.reevaluated.then_some((&self.stored, &self.baked_delta)),
             constant_optimizer: self.constant_optimizer.checkpoint(),
             steps: self.steps,
-            mean_square_slope: self.mean_square_slope,
             keyframe_optimizers: self.keyframe_optimizers.iter().map(Adam::checkpoint).collect(),
         }
     }
@@ -319,7 +312,7 @@ impl<'a> OptimizerState<'a> {
             self.reevaluate_states()?;
         }
         self.constant_optimizer.resume(checkpoint.constant_optimizer);
-        (self.steps, self.mean_square_slope) = (checkpoint.steps, checkpoint.mean_square_slope);
+        self.steps = checkpoint.steps;
         let keyframes = checkpoint.keyframe_optimizers;
         if !keyframes.is_empty() {
             self.enable_keyframes(keyframes.len());
@@ -486,11 +479,9 @@ impl<'a> OptimizerState<'a> {
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
         let OptimizerState { scene, targets, stride, ref frames, ref linearized, .. } = *self;
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
-        let (is_guard, mean_square) = (targets.is_guard(k), &mut self.mean_square_slope);
-        // Also updates the running mean.
         let pull = |render: &_| {
             let mut slope = loss.slope(render, &target);
-            limit_slope(&mut slope, is_guard, mean_square);
+            equalize_slope(&mut slope);
             (0.0, slope)
         };
         let (renderer, view) = (&mut self.renderer, targets.view(k, stride));
