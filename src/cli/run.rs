@@ -36,12 +36,14 @@ use splatsieve::report::{self, ReportOptions, trade_off};
 /// # Errors
 /// Fails if the threads cannot be started, if the command fails, or if standard output cannot be written.
 pub(super) fn run(cli: Cli) -> Result<()> {
-    if let Some(threads) = cli.threads {
-        rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.into())
-            .build_global()
-            .map_err(|error| Error::usage(format!("--threads {threads}: {error}")))?;
-    }
+    // 0 threads: one for each core.
+    let threads = cli.threads.map_or(0, usize::from);
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().map_err(|error| {
+        Error::usage(format!(
+            "cannot start the threads: {error}\n  the system limits the number of threads of this user or job; \
+             --threads 1 needs the fewest"
+        ))
+    })?;
     let events = Events::new(Display::new(cli.quiet));
     match cli.command {
         CommandArgs::Compress(args) => run_compress(*args, cli.quiet, &events),

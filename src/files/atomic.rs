@@ -26,7 +26,9 @@ pub use destination::{Replace, TargetKind};
 use leftovers::clean_up;
 pub use leftovers::remove_leftovers;
 pub use ownership::SUMMARY_FILE;
-use ownership::{add_file_list, check_ending, check_no_stream, entries, exists, files_below, split_target};
+use ownership::{
+    add_file_list, check_ending, check_name_length, check_no_stream, entries, exists, files_below, split_target,
+};
 pub use stream::is_standard_output_used;
 pub use warnings::take_warnings;
 pub use workspace::{ExitGuard, remove_unfinished};
@@ -40,6 +42,7 @@ use workspace::{SCRATCH, Workspace, user_path};
 ///
 /// - a target without a name, or in a folder that does not exist
 /// - `-`, which stands for standard output
+/// - a name of more than [`MAX_NAME_BYTES`](ownership::MAX_NAME_BYTES) bytes
 /// - a file whose name is followed by `/`, and a file or folder whose name is followed by `/.`
 /// - a target that is an input, contains an input or lies inside an input, even if the path leads there only through
 ///   links; this holds for every value of `replace`
@@ -53,6 +56,7 @@ pub fn check_target(target: &Path, kind: TargetKind, inputs: &[&Path], replace: 
     let shown = target.shown();
     check_no_stream(target)?;
     check_ending(target, kind == TargetKind::Folder)?;
+    check_name_length(target)?;
     let real_parent = real_parent(target)?;
     let (_, name) = split_target(target)?;
     // Compare both the entry `target` and the file that it links to. Renaming over a link replaces only the link, but a

@@ -81,7 +81,7 @@ pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     let mut scene = open_scene(&input)?;
     let outlook = InputMeta::from_scene(&scene);
     let run = RunPlan::within_memory(request, outlook, &scene.workload())?;
-    run.check_target(&request.input.path)?;
+    run.check_target(&request.input.path, request.input.cameras.as_deref())?;
     run.check(&scene)?;
     let needs = |work: &Workload, limits: &_| run.estimates(work, limits);
     let plan = MemoryPlan::fit_budget(scene.workload(), input.memory, &input.events, needs)?;

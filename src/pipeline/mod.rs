@@ -75,10 +75,11 @@ pub fn compress(request: &Request) -> Result<Completion<Summary>> {
 
 fn compress_whole(request: &Request) -> Result<Summary> {
     let mut journal = Journal::default();
-    let check = |frames| RunPlan::before_reading(request, frames)?.check_target(&request.input.path);
+    let (path, cameras) = (&request.input.path, request.input.cameras.as_deref());
+    let check = |frames| RunPlan::before_reading(request, frames)?.check_target(path, cameras);
     let plan = |input, work: &Workload| {
         let plan = RunPlan::within_memory(request, input, work)?;
-        plan.check_target(&request.input.path)?;
+        plan.check_target(path, cameras)?;
         Ok(plan)
     };
     let (scene, plan, arrived) = open_to_measure(&request.input, check, plan, &mut journal)?;
@@ -92,7 +93,7 @@ fn compress_whole(request: &Request) -> Result<Summary> {
 /// [`Error::ShardDone`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<CompressedScene> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
-    plan.check_target(&scene.path)?;
+    plan.check_target(&scene.path, request.input.cameras.as_deref())?;
     run_stages(scene, &plan, None, request, Journal::default())
 }
 

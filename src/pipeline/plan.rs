@@ -1,6 +1,7 @@
 //! The plan of a run: its stages with their parameters, the omitted stages with reasons, and the numbers of Gaussians
 //! that ranking and refinement leave. Everything is decided in this module, before any work.
 
+use std::iter;
 use std::path::Path;
 
 use super::ids::{check_ids, parse_ids};
@@ -295,12 +296,14 @@ impl RunPlan {
         self.planned_counts_text() + &lines.collect::<String>()
     }
 
-    /// Checks that a run which reads `input` may write its output. Called before the input is opened.
+    /// Checks that a run which reads the model `input` and the cameras `cameras` may write its output. Called before the
+    /// input is opened. A folder of cameras may contain the output.
     ///
     /// # Errors
-    /// Fails if the output exists already or cannot be created.
-    pub fn check_target(&self, input: &Path) -> Result<()> {
-        self.output.as_ref().map_or(Ok(()), |output| output.check_target(&[input]))
+    /// Fails if the output exists already or cannot be created, or is the input or the camera file.
+    pub fn check_target(&self, input: &Path, cameras: Option<&Path>) -> Result<()> {
+        let read: Vec<&Path> = iter::once(input).chain(cameras.filter(|cameras| cameras.is_file())).collect();
+        self.output.as_ref().map_or(Ok(()), |output| output.check_target(&read))
     }
 
     /// Checks, before any work, that the stages of the plan can run on the scene: the files that they need must exist,

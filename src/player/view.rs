@@ -15,7 +15,7 @@ use crate::player::quantization::{PlayerSteps, component_count};
 use crate::player::track::{MAX_VALUES_PER_FRAME_GROUP, PageSequence, encode};
 use crate::progress::Events;
 use crate::scene::view_selection::render_background;
-use crate::scene::{InputOptions, check_compressed, first_frame_box, open_compressed, open_scene, scratch_beside};
+use crate::scene::{InputOptions, check_compressed, first_frame_box, open_compressed, open_scene};
 
 /// Name of the stage that writes the page, for progress messages and the memory plan.
 const NAME: &str = "view";
@@ -129,8 +129,7 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
         Some(_) => (options.original_frames.unwrap_or(all), options.original_degree.unwrap_or(NO_SH_LIMIT)),
         None => (all, NO_SH_LIMIT),
     };
-    let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
-    let (mut chunks, mut notes) = (ChunkFiles::new(&scratch)?, std::mem::take(&mut scene.notes));
+    let (mut chunks, mut notes) = (ChunkFiles::new(&scene.scratch)?, std::mem::take(&mut scene.notes));
     let times = &scene.source().info().times;
     let asked = ModelView { role: "original", path: &scene.path, times, frames, degree };
     let mut models = vec![add_model(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];

@@ -92,7 +92,7 @@ impl Photographs {
     ///
     /// # Errors
     /// Fails if a file does not exist any more.
-    pub fn file_fingerprints(&self, views: &[FrameView]) -> Result<Vec<(String, u64, u128)>> {
+    pub fn file_fingerprints(&self, views: &[FrameView]) -> Result<Vec<(String, u64, i128)>> {
         let mut files = Vec::with_capacity(views.len());
         for view in views {
             if let Some(file) = self.files.get(&(view.frame, view.view)) {

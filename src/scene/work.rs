@@ -3,7 +3,6 @@
 
 use std::fs;
 use std::path::Path;
-use std::time::UNIX_EPOCH;
 
 use super::Scene;
 use super::input::InputOptions;
@@ -93,8 +92,8 @@ fn cached_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -
 }
 
 /// Returns a key that changes whenever the content of the input may have changed, without reading the input. It stands
-/// for the path of the input, for the options with which it is read, and for the path, length and time of the last
-/// change of each of its files.
+/// for the path of the input, for the options with which it is read, and for the path, length and change time of each of
+/// its files.
 fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
@@ -102,9 +101,9 @@ fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     Ok(CacheKey::new(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
-/// Appends the path, the length in bytes, and the time of the last change (ns since 1970) of the file `path` to
+/// Appends the path, the length in bytes, and the change time ([`splat_platform::change_time`]) of the file `path` to
 /// `files`. If `path` is a folder, appends them for all files in it and in its subfolders, in the order of their paths.
-pub(crate) fn add_file_stamps(path: &Path, files: &mut Vec<(String, u64, u128)>) -> Result<()> {
+pub(crate) fn add_file_stamps(path: &Path, files: &mut Vec<(String, u64, i128)>) -> Result<()> {
     let name = path.to_string_lossy().into_owned();
     // Broken links are not part of an input, so only their paths are recorded.
     let Ok(metadata) = fs::metadata(path) else {
@@ -120,7 +119,32 @@ pub(crate) fn add_file_stamps(path: &Path, files: &mut Vec<(String, u64, u128)>)
         entries.sort();
         return entries.iter().try_for_each(|entry| add_file_stamps(entry, files));
     }
-    let changed = metadata.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
-    files.push((name, metadata.len(), changed.map_or(0, |since| since.as_nanos())));
+    files.push((name, metadata.len(), splat_platform::change_time(&metadata)));
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+
+    use super::*;
+
+    #[test]
+    fn a_file_with_other_content_of_equal_length_and_time_has_another_stamp() {
+        let base = tempfile::tempdir().unwrap();
+        let path = base.path().join("model");
+        let written = |content: &str| {
+            fs::write(&path, content).unwrap();
+            File::options().write(true).open(&path).unwrap().set_modified(std::time::UNIX_EPOCH).unwrap();
+            let mut files = Vec::new();
+            add_file_stamps(&path, &mut files).unwrap();
+            files
+        };
+        let (first, mut again) = (written("1"), Vec::new());
+        add_file_stamps(&path, &mut again).unwrap();
+        assert_eq!(first, again);
+        // Change times are as coarse as the clock of the file system.
+        std::thread::sleep(std::time::Duration::from_millis(50));
+        assert_ne!(first, written("2"));
+    }
 }

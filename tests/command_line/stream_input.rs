@@ -214,7 +214,7 @@ fn broken_streams_are_errors_and_leave_no_files() {
     refused("compress - -o missing/out", &stream, 2, "missing");
     refused("compress - -o out --keep-ids 300", &stream, 2, "below 300");
     refused("compress - -o out.ply", &stream, 2, "10 frames do not fit");
-    refused("compress - -o out --scratch-dir nowhere", &stream, 1, "nowhere");
+    refused("compress - -o out --scratch-dir nowhere", &stream, 2, "nowhere");
 }
 
 #[test]

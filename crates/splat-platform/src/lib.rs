@@ -8,6 +8,7 @@
 //! |---|---|---|---|
 //! | [`read_exact_at`] | leaves the file position alone | as on Linux | moves the file position |
 //! | [`FileStatus`], [`FileIdentity`] | device and inode | as on Linux | volume and file index |
+//! | [`change_time`] | `st_ctime` | as on Linux | modification time |
 //! | [`FileKind`] | all kinds | all kinds | file, folder, link, other |
 //! | [`open_without_waiting`] | `O_NONBLOCK` | as on Linux | plain open, which never waits |
 //! | [`open_stream`] | device or FIFO | as on Linux | refused: no path is recognized as a stream |
@@ -72,12 +73,13 @@ pub use macos::{
 };
 #[cfg(unix)]
 pub use unix::{
-    FolderHandle, create_private_folder, end_on_signals, is_standard_output, is_system_folder, open_stream,
-    open_without_waiting, prefetch_pages, private_permissions, read_exact_at, release_pages, sync_file, sync_folder,
+    FolderHandle, change_time, create_private_folder, end_on_signals, is_standard_output, is_system_folder,
+    open_stream, open_without_waiting, prefetch_pages, private_permissions, read_exact_at, release_pages, sync_file,
+    sync_folder,
 };
 #[cfg(windows)]
 pub use windows::{
-    FolderHandle, create_private_folder, end_on_signals, is_cached, is_standard_output, is_system_folder,
+    FolderHandle, change_time, create_private_folder, end_on_signals, is_cached, is_standard_output, is_system_folder,
     memory_limits, open_stream, open_without_waiting, peak_memory_bytes, prefetch_pages, private_permissions,
     read_exact_at, release_pages, report_truncated_maps, reset_peak_memory, return_freed_memory, sync_file,
     sync_folder,

@@ -1,9 +1,19 @@
 //! Parsers of option values.
 
+use std::path::PathBuf;
+
 use splatsieve::error::quoted;
 use splatsieve::files::cameras::TimesSource;
 
 use crate::cli::recipe_flags::numbers;
+
+/// Parses the path of a folder for temporary files, and checks that files can be created in it.
+pub(super) fn parse_scratch_folder(text: &str) -> Result<PathBuf, String> {
+    match tempfile::tempfile_in(text) {
+        Ok(_) => Ok(PathBuf::from(text)),
+        Err(error) => Err(format!("cannot create a file in it: {error}; name a folder that exists and can be written")),
+    }
+}
 
 /// Parses a length of time, such as `10`, or the start and the end of a time span, such as `0,10`. Returns the length.
 pub(super) fn parse_duration(text: &str) -> Result<f64, String> {

@@ -55,6 +55,9 @@ pub(super) enum Destination {
 /// through a link in a system folder, such as `/dev/stdout` if it is redirected to a file. This program neither writes
 /// nor replaces any of these.
 pub(super) fn destination(target: &Path) -> Result<Destination> {
+    // Without a separator at the end, because `link/` is the folder that the link leads to.
+    let (parent, name) = split_target(target)?;
+    let target = &parent.join(name);
     let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.shown())));
     let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
     let is_link = named.is_symlink();
@@ -118,7 +121,10 @@ pub(super) fn check_replace(target: &Path, kind: TargetKind, replace: Replace) -
         (TargetKind::File, Destination::Folder | Destination::FolderLink) => {
             Err(Error::usage(format!("{shown} is a folder; a file cannot replace it")))
         }
-        (TargetKind::Folder, Destination::File | Destination::FolderLink | Destination::Stream) => {
+        (TargetKind::Folder, Destination::FolderLink) => {
+            Err(Error::usage(format!("{shown} is a link to a folder, which is not replaced; name the folder itself")))
+        }
+        (TargetKind::Folder, Destination::File | Destination::Stream) => {
             Err(Error::usage(format!("{shown} is no folder; a folder cannot replace it")))
         }
         (TargetKind::File, Destination::File) => Ok(()),

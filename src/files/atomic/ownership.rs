@@ -19,6 +19,10 @@ use crate::error::{Error, Result, ShowPath, quoted};
 /// [`super::StagedFolder::commit`] and [`super::StagedFiles::commit`] add this list.
 pub const SUMMARY_FILE: &str = "summary.json";
 
+/// Maximum length in bytes of the name of an output: 255, the limit of common file systems, less the 24 bytes that the
+/// name of the hidden folder beside it adds ([`super::workspace::publishing_name`]).
+pub(super) const MAX_NAME_BYTES: usize = 231;
+
 /// Maximum size in bytes of a file that is read as a summary: 16 MiB, enough to list about 500,000 files. Larger files
 /// are not summaries of this program and are not read.
 const MAX_SUMMARY: u64 = 16 << 20;
@@ -225,6 +229,19 @@ pub(super) fn check_no_stream(target: &Path) -> Result<()> {
              only `splatsieve convert INPUT -` writes there, a frame stream; ./- is a file or folder named '-'",
         )),
         false => Ok(()),
+    }
+}
+
+/// Checks that the name of the output `target` is short enough for the names that are made of it while it is written.
+pub(super) fn check_name_length(target: &Path) -> Result<()> {
+    let (_, name) = split_target(target)?;
+    match name.len() {
+        ..=MAX_NAME_BYTES => Ok(()),
+        length => Err(Error::usage(format!(
+            "{}: expected a name of at most {MAX_NAME_BYTES} bytes, because temporary files beside the output have longer \
+             names; found {length} bytes\n  choose a shorter name",
+            target.shown()
+        ))),
     }
 }
 

@@ -154,6 +154,37 @@ fn a_path_that_does_not_end_in_its_name_is_refused() {
 }
 
 #[test]
+#[cfg(unix)]
+fn a_link_to_a_folder_is_refused_also_with_a_slash_behind_it() {
+    let base = tempfile::tempdir().unwrap();
+    fs::create_dir(base.path().join("real")).unwrap();
+    std::os::unix::fs::symlink("real", base.path().join("link")).unwrap();
+    for name in ["link", "link/", "link//"] {
+        let target = base.path().join(name);
+        assert!(refusal(&target, TargetKind::Folder, &[], Replace::Never).contains("exists already"), "{name}");
+        assert!(
+            refusal(&target, TargetKind::Folder, &[], Replace::Existing).contains("is a link to a folder"),
+            "{name}"
+        );
+    }
+}
+
+#[test]
+fn a_name_that_leaves_no_room_for_temporary_names_is_refused() {
+    let base = tempfile::tempdir().unwrap();
+    for kind in [TargetKind::File, TargetKind::Folder] {
+        let target = |length: usize| base.path().join("x".repeat(length));
+        check_target(&target(231), kind, &[], Replace::Never).unwrap();
+        assert!(refusal(&target(232), kind, &[], Replace::Never).contains("at most 231 bytes"));
+    }
+    let longest = base.path().join("x".repeat(231));
+    let staged = StagedFile::new(&longest, Replace::Never).unwrap();
+    fs::write(staged.path(), "content").unwrap();
+    staged.commit().unwrap();
+    assert_eq!(names_in(base.path()), ["x".repeat(231)]);
+}
+
+#[test]
 fn a_dash_is_no_name_of_an_output() {
     for kind in [TargetKind::File, TargetKind::Folder] {
         assert!(refusal(Path::new("-"), kind, &[], Replace::Never).contains("stands for standard output"));

@@ -59,6 +59,13 @@ impl FileStatus {
     }
 }
 
+/// Returns the time, in nanoseconds since 1970, at which the content or the metadata of a file last changed. Programs
+/// cannot set it, in contrast to the modification time, so it also differs after a file was replaced by one with an
+/// equal modification time.
+pub fn change_time(found: &Metadata) -> i128 {
+    i128::from(found.ctime()) * 1_000_000_000 + i128::from(found.ctime_nsec())
+}
+
 /// Returns the kind of a folder entry that is not a regular file, folder or link.
 pub(crate) fn special_kind(found: FileType) -> FileKind {
     match found {

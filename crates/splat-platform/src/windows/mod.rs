@@ -4,11 +4,11 @@
 mod folder;
 mod memory;
 
-use std::fs::{File, OpenOptions, Permissions};
+use std::fs::{File, Metadata, OpenOptions, Permissions};
 use std::io;
 use std::mem::MaybeUninit;
 use std::ops::Range;
-use std::os::windows::fs::{FileExt as _, OpenOptionsExt as _};
+use std::os::windows::fs::{FileExt as _, MetadataExt as _, OpenOptionsExt as _};
 use std::os::windows::io::AsRawHandle as _;
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -72,6 +72,12 @@ impl FileStatus {
     pub fn from_path(path: &Path) -> io::Result<FileStatus> {
         FileStatus::from_file(&OpenOptions::new().read(true).custom_flags(FILE_FLAG_BACKUP_SEMANTICS).open(path)?)
     }
+}
+
+/// Returns the modification time of a file, in units of 100 ns since 1601. Unlike the change time of other systems,
+/// programs can set it.
+pub fn change_time(found: &Metadata) -> i128 {
+    i128::from(found.last_write_time())
 }
 
 /// Opens the file at `path` for reading. On Windows this never waits.
