@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 use crate::archive::ArchiveSize;
 use crate::error::{Error, Result};
 
+/// Files of a model besides its Gaussians, for [`ModelSize::from_cloud_file`]: none.
+pub(super) const NO_FILES: [&str; 0] = [];
+
 /// Size in bytes of all files of a model that a renderer opens, divided into parts. Files that only training reads are
 /// not counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
 use super::cfg_args;
 use super::files::copy;
-use super::size::{ModelSize, bytes_below, file_bytes};
+use super::size::{ModelSize, NO_FILES, bytes_below, file_bytes};
 use super::trajectories::{state_bytes, write_sequence};
 use crate::archive::{ArchiveContent, TensorRole};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
@@ -80,7 +80,7 @@ impl InputModel for ModelFolder {
                 let folder = iteration_folder(path, self.paths().iteration);
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
-            OutputKind::Ply => ModelSize::from_cloud_file(path, [""; 0]),
+            OutputKind::Ply => ModelSize::from_cloud_file(path, NO_FILES),
             // All other outputs are written from the states at the frames. The caller measures an archive itself.
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }

@@ -21,7 +21,7 @@ use super::archive::reopen::Reopener;
 use super::cfg_args::Arguments;
 use super::files::copy;
 use super::iterations::find_iteration;
-use super::size::{ModelSize, bytes_below};
+use super::size::{ModelSize, NO_FILES, bytes_below};
 use super::trajectories::write_sequence;
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
@@ -244,7 +244,7 @@ impl InputModel for SpacetimeGaussians {
                 let files = Files::find(path, &OpenOptions::default())?;
                 ModelSize::from_cloud_file(&files.cloud, files.other_files())
             }
-            OutputKind::Ply | OutputKind::Splatv => ModelSize::from_cloud_file(path, [""; 0]),
+            OutputKind::Ply | OutputKind::Splatv => ModelSize::from_cloud_file(path, NO_FILES),
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }

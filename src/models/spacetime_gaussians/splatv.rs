@@ -31,7 +31,7 @@ use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, Op
 use crate::models::motion_model::window::MAX_LOGIT;
 use crate::models::motion_model::{MotionModelFrames, compressed_raw, propose_proxies};
 use crate::models::opened::{InputFormat, Opened};
-use crate::models::size::{ModelSize, bytes_below};
+use crate::models::size::{ModelSize, NO_FILES, bytes_below};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -177,12 +177,12 @@ impl InputModel for SplatvModel {
     }
 
     fn size(&self) -> Result<ModelSize> {
-        ModelSize::from_cloud_file(self.file.path(), [""; 0])
+        ModelSize::from_cloud_file(self.file.path(), NO_FILES)
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
-            OutputKind::Splatv => ModelSize::from_cloud_file(path, [""; 0]),
+            OutputKind::Splatv => ModelSize::from_cloud_file(path, NO_FILES),
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }

@@ -13,7 +13,7 @@ use super::archive::pack::FileContent;
 use super::archive::reopen::Reopener;
 use super::in_checkpoint::{ProxyRule, with_times, write_frames};
 use super::motion_model::{MotionModelFrames, propose_proxies};
-use super::size::{ModelSize, bytes_below};
+use super::size::{ModelSize, NO_FILES, bytes_below};
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
@@ -60,12 +60,12 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
     }
 
     fn size(&self) -> Result<ModelSize> {
-        ModelSize::from_cloud_file(&self.path, [""; 0])
+        ModelSize::from_cloud_file(&self.path, NO_FILES)
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind == self.description.default_output_kind {
-            true => ModelSize::from_cloud_file(path, [""; 0]),
+            true => ModelSize::from_cloud_file(path, NO_FILES),
             false => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
