@@ -10,11 +10,9 @@
 //!   `raw/sum_f32`, of f32 one after the other, and `raw/sum_u32`, which is as fast as memory. The goal is half the
 //!   speed of `raw/sum_f32`.
 //!
-//! The second benchmarks compare two ways to read ahead, on all threads. In `blocks`, every thread reads a block of
-//! Gaussians and announces its next frame block. In `stages`, separate threads fetch, decode and accumulate.
-//! - `warm_*` reads from the page cache.
-//! - `cold_*` drops the file from the page cache first (Linux).
-//! - `slow_*` simulates a disk of [`SLOW`] bytes per second, for which both ways wait as for a real one.
+//! The second benchmarks, `read_ahead/*`, scan a file on all threads. Every thread reads a block of Gaussians and
+//! announces its next frame block. `warm_*` reads from the page cache, `cold_*` drops the file from the page cache first
+//! (Linux).
 //!
 //! The third benchmarks, `raw_frames/*`, copy every frame of uncompressed tiles to a state of the caller, on all
 //! threads. `ordinary` uses positioned reads. The others use a memory map and differ in when they release its pages:
@@ -25,11 +23,7 @@
 
 use std::collections::BTreeMap;
 use std::hint::black_box;
-use std::ops::Range;
 use std::path::Path;
-use std::sync::Mutex;
-use std::thread;
-use std::time::{Duration, Instant};
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::{Compression, Reader, TileBuffer, TileFrames, TileId, TouchedPages};
@@ -40,14 +34,12 @@ use splatsieve::model::hash_id;
 use splatsieve::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
 use splatsieve::outputs::container::write_container;
 use splatsieve::recipe::Recipe;
-use splatsieve::source::{BlockReader, FrameSource, Ids, Prefetch};
+use splatsieve::source::{BlockReader, FrameSource, Ids};
 use splatsieve::statistics::ScanPlan;
 use splatsieve::statistics::pass::scan;
 
 const GAUSSIANS: usize = 16_384;
 const FRAMES: usize = 64;
-/// Speed of the simulated slow disk, bytes per second.
-const SLOW: f64 = 300e6;
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
@@ -169,113 +161,6 @@ fn benches(criterion: &mut Criterion) {
     }
 }
 
-/// Simulated disk that handles one request after the other.
-struct Disk(Mutex<Instant>);
-
-impl Disk {
-    /// Requests `bytes` bytes from the simulated disk, after all earlier requests. Returns the time at which the bytes
-    /// are available.
-    fn request(&self, bytes: u64) -> Instant {
-        let mut busy = self.0.lock().unwrap();
-        *busy = (*busy).max(Instant::now()) + Duration::from_secs_f64(bytes as f64 / SLOW);
-        *busy
-    }
-}
-
-fn wait_for(ready: Instant) {
-    thread::sleep(ready.saturating_duration_since(Instant::now()));
-}
-
-/// Container whose frames are read in one of two ways: with fetching, decoding and accumulating on separate threads
-/// (`in_stages`), or block by block on every thread. Reads wait for the simulated disk if `disk` is set.
-struct BenchSource<'a> {
-    container: &'a Container,
-    in_stages: bool,
-    disk: Option<Disk>,
-}
-
-impl BenchSource<'_> {
-    fn bytes(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) -> u64 {
-        let reader = self.container.reader();
-        let layout = reader.layout();
-        let block = |id: usize, of: u32| (id / of as usize) as u32;
-        let mut sum = 0;
-        for (column, _) in Attributes::all().iter().enumerate().filter(|&(_, column)| want.contains(column)) {
-            for gaussian_block in
-                block(gaussians.start, layout.gaussian_block)..=block(gaussians.end - 1, layout.gaussian_block)
-            {
-                let frame_block = block(frames.start, layout.frame_block);
-                let at = TileId { column: column as u32, gaussian_block, frame_block };
-                sum += reader.tile_info(at).unwrap().stored_bytes;
-            }
-        }
-        sum
-    }
-}
-
-impl FrameSource for BenchSource<'_> {
-    fn info(&self) -> &SequenceInfo {
-        self.container.info()
-    }
-
-    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        let reader = self.container.open(ids.clone())?;
-        match ids {
-            Ids::Range(gaussians) if self.disk.is_some() && !self.in_stages => {
-                Ok(Box::new(WaitingReader { fed: self, gaussians, reader, coming: None }))
-            }
-            _ => Ok(reader),
-        }
-    }
-
-    fn prefetcher(&self) -> Option<&dyn Prefetch> {
-        self.in_stages.then_some(self)
-    }
-}
-
-impl Prefetch for BenchSource<'_> {
-    fn frame_block(&self) -> usize {
-        self.container.frame_block()
-    }
-
-    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) {
-        match &self.disk {
-            Some(disk) => wait_for(disk.request(self.bytes(gaussians, frames, want))),
-            None => self.container.fetch(gaussians, frames, want),
-        }
-    }
-}
-
-/// Reader of a block of Gaussians that waits for the simulated disk. For the first frame block it waits the full time.
-/// It requests every later frame block in advance, and so waits only for the remaining time.
-struct WaitingReader<'a> {
-    fed: &'a BenchSource<'a>,
-    gaussians: Range<usize>,
-    reader: Box<dyn BlockReader + 'a>,
-    /// First frame of the frame block that was requested in advance, and the time at which its bytes are available.
-    coming: Option<(usize, Instant)>,
-}
-
-impl BlockReader for WaitingReader<'_> {
-    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
-        let (block_frames, info) = (self.fed.frame_block(), self.fed.info());
-        if frame.is_multiple_of(block_frames)
-            && let Some(disk) = &self.fed.disk
-        {
-            let request =
-                |start: usize, want| disk.request(self.fed.bytes(self.gaussians.clone(), start..start + 1, want));
-            let now = match self.coming {
-                Some((start, ready)) if start == frame => ready,
-                _ => request(frame, want),
-            };
-            let next = frame + block_frames;
-            self.coming = (next < info.times.len()).then(|| (next, request(next, info.varying)));
-            wait_for(now);
-        }
-        self.reader.read(frame, want, out)
-    }
-}
-
 /// Removes the file at `path` from the page cache of the operating system.
 #[cfg(target_os = "linux")]
 fn drop_cached(path: &Path) {
@@ -298,23 +183,20 @@ fn read_ahead(criterion: &mut Criterion) {
         let path = folder.path().join(format!("{kind}.gseq"));
         pack(&source, &path, compression);
         let container = Container::open(&path).unwrap();
-        for (speed, slow) in [("warm", false), ("cold", false), ("slow", true)] {
-            let mut group = criterion.benchmark_group(format!("{speed}_{kind}"));
-            group.sample_size(20).throughput(Throughput::Elements((GAUSSIANS * FRAMES) as u64));
-            for (way, in_stages) in [("blocks", false), ("stages", true)] {
-                let disk = slow.then(|| Disk(Mutex::new(Instant::now())));
-                let fed = BenchSource { container: &container, in_stages, disk };
-                group.bench_function(way, |bencher| {
-                    let before = || {
-                        #[cfg(target_os = "linux")]
-                        if speed == "cold" {
-                            drop_cached(&path);
-                        }
-                    };
-                    bencher.iter_batched(before, |()| scan(&fed, &schedule, &plan).unwrap(), BatchSize::PerIteration);
-                });
-            }
+        let mut group = criterion.benchmark_group("read_ahead");
+        group.sample_size(20).throughput(Throughput::Elements((GAUSSIANS * FRAMES) as u64));
+        for speed in ["warm", "cold"] {
+            group.bench_function(format!("{speed}_{kind}"), |bencher| {
+                let before = || {
+                    #[cfg(target_os = "linux")]
+                    if speed == "cold" {
+                        drop_cached(&path);
+                    }
+                };
+                bencher.iter_batched(before, |()| scan(&container, &schedule, &plan).unwrap(), BatchSize::PerIteration);
+            });
         }
+        group.finish();
         if kind == "raw" {
             raw_frames(criterion, container.reader(), varying);
         }

@@ -194,12 +194,6 @@ pub trait FrameSource: Send + Sync {
     fn reads(&self) -> ReadCounts {
         ReadCounts::default()
     }
-
-    /// Returns the object that can fetch bytes from the disk before a reader needs them. Returns `None` if this saves
-    /// no time.
-    fn prefetcher(&self) -> Option<&dyn Prefetch> {
-        None
-    }
 }
 
 /// Deformation field, or another differentiable motion model: computes the state of each Gaussian at a frame from its
@@ -246,18 +240,6 @@ pub trait FeatureDecoder: Sync {
     fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
-/// Fetching of bytes from a disk before a reader needs them. Callers run [`Prefetch::fetch`] in a thread of its own,
-/// because it waits for the disk.
-pub trait Prefetch: Sync {
-    /// Returns the number of consecutive frames that are fetched and decoded together. Such a frame block starts at a
-    /// multiple of this number.
-    fn frame_block(&self) -> usize;
-
-    /// Fetches the bytes of the attributes `want` of `gaussians` at `frames`, and waits for them. Failures are reported
-    /// later, when the bytes are read.
-    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes);
-}
-
 /// Reader of one block of Gaussians at any frame.
 pub trait BlockReader: Send {
     /// Reads the attributes `want` of the block at `frame` into `out`, which is resized in these attributes. Leaves the
@@ -270,13 +252,6 @@ pub trait BlockReader: Send {
     /// Announces the frames that will be read from now on. The plan `_wanted` lists them and limits how many of them
     /// the reader may keep in memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _plan: &ReadPlan) {}
-
-    /// Decodes the attributes `_want` at frame `_frame`, and at the other frames of the same tile (frames that are
-    /// stored and decoded together), so that later calls of [`BlockReader::read`] only have to copy values. Decodes
-    /// nothing for frames that the reader may not keep in memory.
-    fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
-        Ok(())
-    }
 }
 
 #[cfg(test)]

@@ -101,18 +101,6 @@ impl MappedFile {
         }
     }
 
-    /// Reads the bytes of `range` from disk into the page cache of the operating system and waits for them. They pass
-    /// through the buffer `chunk`, and this process keeps none of them.
-    pub(crate) fn fetch(&self, range: std::ops::Range<u64>, chunk: &mut Vec<u8>) -> Result<()> {
-        self.read_chunks(range, chunk, |_, _| Ok(()))
-    }
-
-    /// Returns whether the byte at `offset` is in the page cache, so that reading it does not wait for the disk; `None`
-    /// if the operating system does not tell.
-    pub(crate) fn is_cached(&self, offset: u64) -> Option<bool> {
-        splat_platform::is_cached(&self.file, offset)
-    }
-
     /// Gives the pages of `range`, and the neighboring pages mapped with them, back to the operating system, so that
     /// they no longer count as memory of this process. Slices of these pages stay valid: their bytes are read from the
     /// file again.

@@ -334,32 +334,6 @@ impl Reader {
         self.file.will_need(pending);
     }
 
-    /// Reads the stored bytes of `tiles` from disk into the page cache of the operating system and waits for them, so
-    /// that threads that decode these tiles need not wait. Takes a small buffer. Read errors are ignored here; they
-    /// appear when the tiles are read.
-    pub fn prefetch_and_wait(&self, tiles: impl IntoIterator<Item = TileId>) {
-        let mut chunk = Vec::new();
-        for (_, tile) in tiles.into_iter().filter_map(|at| self.record(at).ok()) {
-            _ = self.file.fetch(tile.offset..tile.offset + u64::from(tile.stored_bytes), &mut chunk);
-        }
-    }
-
-    /// Estimates whether the whole file is in the page cache of the operating system: returns whether at least 90% of
-    /// `samples` evenly spaced offsets are. Returns `None` if the operating system does not tell.
-    pub fn is_cached(&self, samples: u64) -> Option<bool> {
-        let step = (self.file.len() / samples.max(1)).max(1);
-        let mut places = (0..self.file.len()).step_by(step as usize).map(|offset| self.file.is_cached(offset));
-        // 90% of the offsets suffice: reading a few pages from disk costs less than the method of reading for files
-        // that are not cached.
-        let (mut cached, mut all) = (0, 0);
-        places.try_for_each(|found| {
-            cached += u64::from(found?);
-            all += 1;
-            Some(())
-        })?;
-        Some(10 * cached >= 9 * all)
-    }
-
     /// Adds `tiles` tiles and `bytes` bytes to the counts of [`Reader::tiles_read`].
     fn count(&self, tiles: u64, bytes: usize) {
         // Relaxed ordering suffices: the sums are read only after the reading is done.

@@ -119,7 +119,7 @@ pub fn check_frame_count_applies(
     kind: OutputKind,
     output: &Path,
 ) -> Result<()> {
-    let is_one_frame = input.frames == Some(1) && model.timing() == TimeOrigin::Continuous;
+    let is_one_frame = input.frames == Some(1) && model.description().timing == TimeOrigin::Continuous;
     match is_one_frame && model.keeps_motion(kind) {
         true => Err(Error::usage(format!(
             "{}: --frames 1 asks for one frame, but this output holds the whole model with its motion\n  leave out \

@@ -280,10 +280,11 @@ pub fn info(options: &InputOptions) -> Result<InputInfo> {
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));
     let mut summary = InputSummary::new(&*input, &options.path, input.digest()?)?;
-    if input.timing() == TimeOrigin::Continuous {
+    let description = input.description();
+    if description.timing == TimeOrigin::Continuous {
         summary.frames = None;
     }
-    Ok(InputInfo { input: summary, times, columns: input.columns()?, notes: input.notes() })
+    Ok(InputInfo { input: summary, times, columns: input.columns()?, notes: description.notes })
 }
 
 /// Returns the workload (sizes from which memory and time are estimated) of reading `input` without rendering it.

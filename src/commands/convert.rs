@@ -66,7 +66,7 @@ pub fn convert(
     }
     let opened = open_input(input)?;
     let (model, source) = (&*opened.input, opened.input.source());
-    let own = match model.default_output_kind() {
+    let own = match model.description().default_output_kind {
         OutputKind::Gseq => OutputKind::PlySequence,
         own => own,
     };

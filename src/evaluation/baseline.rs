@@ -46,7 +46,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
         None => gather(source, &ids, 0, Attributes::OPACITY | Attributes::LOG_SCALE)?,
     };
     let kept = largest(baseline, &state, ids, target_count);
-    let kind = OutputKind::from_path(output, None, scene.input.default_output_kind());
+    let kind = OutputKind::from_path(output, None, scene.input.description().default_output_kind);
     scene.input.check_output(kind, output)?;
     let compressed = CompressedModel::pruned(kept, &Recipe::preset("default")?.merge);
     write_without_companions(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)

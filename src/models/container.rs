@@ -3,16 +3,16 @@
 use gseq::{Encoding, Reader, TileId};
 
 use super::linked::UnlinkedFrames;
-use super::size::bytes_read_for;
+use super::size::{ModelSize, file_bytes};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::container::Container;
-use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, TimeOrigin};
-use crate::models::opened::{FrameFormat, Opened};
+use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelDescription, TimeOrigin};
+use crate::models::opened::{InputFormat, Opened};
 use crate::source::FrameSource;
 
 /// Format of containers of frames (`.gseq`), which store the state of every Gaussian at every frame: recognizes and
 /// opens a file.
-pub(super) const ENTRY: FrameFormat = FrameFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
         let container = Container::open_within(path, options.memory)?;
@@ -21,13 +21,20 @@ pub(super) const ENTRY: FrameFormat = FrameFormat {
             let frames = UnlinkedFrames::from_model(Box::new(container), "linked gseq container", options);
             return Ok(Opened::Unlinked(Box::new(frames)));
         }
-        Ok(Opened::Model(Box::new(container)))
+        Ok(Opened::from_model(container))
     },
 };
 
 impl InputModel for Container {
-    fn kind(&self) -> &'static str {
-        "gseq container"
+    fn description(&self) -> ModelDescription {
+        ModelDescription {
+            kind: "gseq container",
+            timing: TimeOrigin::Stamped,
+            may_be_linked: true,
+            has_explicit_frames: true,
+            archives_as_frames: true,
+            ..ModelDescription::default()
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -38,16 +45,8 @@ impl InputModel for Container {
         Ok(Container::digest(self))
     }
 
-    fn bytes(&self) -> Result<u64> {
-        bytes_read_for([self.path()])
-    }
-
-    fn may_be_linked(&self) -> bool {
-        true
-    }
-
-    fn has_explicit_frames(&self) -> bool {
-        true
+    fn size(&self) -> Result<ModelSize> {
+        Ok(ModelSize::from_frames(file_bytes([self.path()])?))
     }
 
     fn memory_profile(&self) -> MemoryProfile {
@@ -63,10 +62,6 @@ impl InputModel for Container {
 
     fn hold_decoded(&self) {
         Container::hold_decoded(self, self.decoded_bytes());
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Stamped
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {

@@ -7,7 +7,7 @@ use std::path::Path;
 use crate::error::Error;
 use crate::files::checkpoint::{Checkpoint, Pickle};
 use crate::limits::ReadLimit;
-use crate::models::input_model::ModelFormat;
+use crate::models::opened::InputFormat;
 
 /// Advice at the end of every error message of this module. It works for models of any renderer.
 const ADVICE: &str = "export its frames with its own renderer, either as PLY files (one per frame, with the same \
@@ -15,7 +15,7 @@ const ADVICE: &str = "export its frames with its own renderer, either as PLY fil
 
 /// Entry for checkpoints of unsupported trainers and for folders that contain one: recognizes them, and refuses to open
 /// them with an error that says how to convert the model.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| match found.is_folder {
         true => describe_folder(found.path).is_some(),
         false => found.is_checkpoint(),

@@ -28,8 +28,8 @@ use crate::source::FrameSource;
 /// The default methods suit explicit trajectories, where the state of every Gaussian is stored for every frame. Formats
 /// that compute frames from stored parameters override them.
 pub trait InputModel: Send + Sync {
-    /// Returns the name of the model format, shown to users.
-    fn kind(&self) -> &'static str;
+    /// Returns the properties of the input that do not depend on single Gaussians, and notes for the user.
+    fn description(&self) -> ModelDescription;
 
     /// Returns the source from which the attributes of the Gaussians at each frame are read.
     fn source(&self) -> &dyn FrameSource;
@@ -40,19 +40,19 @@ pub trait InputModel: Send + Sync {
     /// Fails if a file cannot be read.
     fn digest(&self) -> Result<String>;
 
-    /// Returns the size in bytes of all files that a renderer opens; for a stream, the number of bytes received.
+    /// Returns the size of all files that a renderer opens, divided into Gaussians, deformation field, frames and rest;
+    /// for a stream, the number of bytes received.
     ///
     /// # Errors
     /// Fails if a file no longer exists.
-    fn bytes(&self) -> Result<u64>;
+    fn size(&self) -> Result<ModelSize>;
 
-    /// Returns the size of the input like [`InputModel::bytes`], divided into Gaussians, deformation field, frames and
-    /// rest.
+    /// Returns the total of [`InputModel::size`], bytes.
     ///
     /// # Errors
     /// Fails if a file no longer exists.
-    fn size(&self) -> Result<ModelSize> {
-        Ok(ModelSize::from_frames(self.bytes()?))
+    fn bytes(&self) -> Result<u64> {
+        Ok(self.size()?.total())
     }
 
     /// Returns the size of the output that [`InputModel::write`] wrote to `path` as `kind`, divided into Gaussians,
@@ -79,19 +79,6 @@ pub trait InputModel: Send + Sync {
     /// Tells the input that it may keep decoded values in memory, up to the bytes of [`MemoryProfile::decoded`].
     fn hold_decoded(&self) {}
 
-    /// Returns where the time stamps of frames come from.
-    fn timing(&self) -> TimeOrigin;
-
-    /// Returns the unit of the camera times, for models whose frame times come from cameras.
-    fn time_convention(&self) -> TimeConvention {
-        TimeConvention::Normalized
-    }
-
-    /// Returns the duration of the model in its own time unit. It is used if no frame times are given.
-    fn duration(&self) -> f64 {
-        1.0
-    }
-
     /// Returns the input with frames at `times`.
     ///
     /// # Errors
@@ -99,27 +86,6 @@ pub trait InputModel: Send + Sync {
     /// another number of entries. Always fails for an input whose files store the times of frames
     /// ([`TimeOrigin::Stamped`]).
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>>;
-
-    /// Returns notes for the user, such as repairs or guesses made while opening.
-    fn notes(&self) -> Vec<String> {
-        Vec::new()
-    }
-
-    /// Returns the folder of the training data, where the cameras may be found, if the input names it.
-    fn data_folder(&self) -> Option<&str> {
-        None
-    }
-
-    /// Returns the number n of training frames if the input gives it. Frame i, counted from 0, lies at the fraction i/n
-    /// of the time span. So the last frame is one frame interval before the end of the time span.
-    fn data_frames(&self) -> Option<usize> {
-        None
-    }
-
-    /// Returns the background color used in training if the input names it.
-    fn background(&self) -> Option<[f32; 3]> {
-        None
-    }
 
     /// Returns the merge class of Gaussian `id`, such as foreground or background. Gaussians of different classes are
     /// never merged.
@@ -142,23 +108,12 @@ pub trait InputModel: Send + Sync {
         Ok(Vec::new())
     }
 
-    /// Returns a note for the user about the renders of frames that were changed when they were linked; `None` if each
-    /// frame has the renders of the input.
-    fn tracking_note(&self) -> Option<String> {
-        None
-    }
-
-    /// Returns the kind of output that is written if neither the user nor the output path specifies one.
-    fn default_output_kind(&self) -> OutputKind {
-        DEFAULT_OUTPUT
-    }
-
     /// Returns whether an output of the kind `kind` stores the motion of this model itself, in the model's own time
     /// unit, instead of frames or of motion that is fitted to frames.
     fn keeps_motion(&self, kind: OutputKind) -> bool {
         match kind {
             OutputKind::Model => true,
-            OutputKind::Archive => !self.archives_as_frames(),
+            OutputKind::Archive => !self.description().archives_as_frames,
             _ => false,
         }
     }
@@ -175,7 +130,8 @@ pub trait InputModel: Send + Sync {
     /// Fails if it cannot be written; the message lists kinds of output that work.
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
-            OutputKind::Archive if self.archives_as_frames() => Ok(()),
+            OutputKind::Archive => Ok(()),
+            OutputKind::Model if self.description().default_output_kind == OutputKind::Model => Ok(()),
             _ => check_output(self.source().info().times.len(), kind, path),
         }
     }
@@ -199,11 +155,6 @@ pub trait InputModel: Send + Sync {
         Ok(false)
     }
 
-    /// Returns the reason why SH coefficients of every degree must be kept; `None` if the SH degree may be lowered.
-    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
-        None
-    }
-
     /// Returns everything that an archive (`.gsz`) of the compressed model `compressed` stores.
     ///
     /// # Errors
@@ -221,24 +172,6 @@ pub trait InputModel: Send + Sync {
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         let _ = content;
         Err(Error::usage(NO_ARCHIVE))
-    }
-
-    /// Returns whether the user may ask to link the frames anew, that is, to match the Gaussians of different frames,
-    /// although the input already identifies each Gaussian across frames.
-    fn may_be_linked(&self) -> bool {
-        false
-    }
-
-    /// Returns whether the state of every Gaussian is stored for every frame. Refinement may then add a delta that
-    /// varies in time ([`CompressedModel::trajectory_delta`]).
-    fn has_explicit_frames(&self) -> bool {
-        false
-    }
-
-    /// Returns whether an archive of this input holds its frames, instead of the parameters of a model. Such an archive
-    /// is a container in the format `.gseq` with an error bound for each attribute.
-    fn archives_as_frames(&self) -> bool {
-        self.has_explicit_frames()
     }
 
     /// Returns the frames of the compressed model `compressed` as they will be read from the output.
@@ -263,6 +196,65 @@ pub trait InputModel: Send + Sync {
         events: &Events,
     ) -> Result<Vec<String>> {
         write_trajectories(self.source(), compressed, kind, path, limits, events)
+    }
+}
+
+/// Properties of an input that do not depend on single Gaussians. The defaults are those of frames in files.
+#[derive(Debug, Clone)]
+pub struct ModelDescription {
+    /// Name of the model format, shown to users.
+    pub kind: &'static str,
+    /// Notes for the user, such as repairs or guesses made while opening.
+    pub notes: Vec<String>,
+    /// Origin of the time stamps of frames.
+    pub timing: TimeOrigin,
+    /// Unit of the camera times, for models whose frame times come from cameras.
+    pub time_convention: TimeConvention,
+    /// Duration of the model in its own time unit. It is used if no frame times are given.
+    pub duration: f64,
+    /// Folder of the training data, where the cameras may be found, if the input names it.
+    pub data_folder: Option<String>,
+    /// Number n of training frames if the input gives it. Frame i, counted from 0, lies at the fraction i/n of the time
+    /// span. So the last frame is one frame interval before the end of the time span.
+    pub data_frames: Option<usize>,
+    /// Background color used in training if the input names it.
+    pub background: Option<[f32; 3]>,
+    /// Kind of output that is written if neither the user nor the output path specifies one.
+    pub default_output_kind: OutputKind,
+    /// Reason why SH coefficients of every degree must be kept; `None` if the SH degree may be lowered.
+    pub reason_to_keep_sh_degree: Option<&'static str>,
+    /// Whether the user may ask to link the frames anew, that is, to match the Gaussians of different frames, although
+    /// the input already identifies each Gaussian across frames.
+    pub may_be_linked: bool,
+    /// Whether the state of every Gaussian is stored for every frame. Refinement may then add a delta that varies in
+    /// time ([`CompressedModel::trajectory_delta`]).
+    pub has_explicit_frames: bool,
+    /// Whether an archive of this input holds its frames, instead of the parameters of a model. Such an archive is a
+    /// container in the format `.gseq` with an error bound for each attribute.
+    pub archives_as_frames: bool,
+    /// Note for the user about the renders of frames that were changed when they were linked; `None` if each frame has
+    /// the renders of the input.
+    pub tracking_note: Option<String>,
+}
+
+impl Default for ModelDescription {
+    fn default() -> ModelDescription {
+        ModelDescription {
+            kind: "",
+            notes: Vec::new(),
+            timing: TimeOrigin::Numbered,
+            time_convention: TimeConvention::Normalized,
+            duration: 1.0,
+            data_folder: None,
+            data_frames: None,
+            background: None,
+            default_output_kind: DEFAULT_OUTPUT,
+            reason_to_keep_sh_degree: None,
+            may_be_linked: false,
+            has_explicit_frames: false,
+            archives_as_frames: false,
+            tracking_note: None,
+        }
     }
 }
 
@@ -355,15 +347,6 @@ pub struct ColumnInfo {
     pub min: Option<f32>,
     /// Largest finite value of the column (attribute); `None` if it has no finite values.
     pub max: Option<f32>,
-}
-
-/// A format: how its files are recognized and opened. `Input` is the result of opening them.
-pub(super) struct ModelFormat<Input = Box<dyn InputModel>> {
-    /// Returns whether the input has this format, judged by the content of its files.
-    pub(super) recognizes: fn(&FoundInput) -> bool,
-    /// Opens the input. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no frames until frame
-    /// times are set.
-    pub(super) open: fn(&Path, &OpenOptions) -> Result<Input>,
 }
 
 /// Number of bytes at the start of a file by which its format is recognized; enough for the header of a

@@ -4,6 +4,7 @@
 //! which format an input has.
 
 pub mod archive;
+mod cfg_args;
 mod container;
 mod deform_folder;
 mod deformable_3d_gaussians;
@@ -27,6 +28,7 @@ mod static_3d_gaussians;
 mod still_files;
 pub mod stream;
 pub mod trajectories;
+mod unpacked;
 mod unrecognized;
 mod windowed;
 
@@ -35,9 +37,9 @@ use std::path::Path;
 
 pub use crate::files::splatv::rows::ZeroRotation;
 pub use crate::models::input_model::{
-    ColumnInfo, InputModel, LinkMode, MemoryProfile, OpenOptions, TimeOrigin, TrainingConventions,
+    ColumnInfo, InputModel, LinkMode, MemoryProfile, ModelDescription, OpenOptions, TimeOrigin, TrainingConventions,
 };
-use deform_folder::Arguments;
+use cfg_args::Arguments;
 pub use four_d_gaussians::ModelFolder;
 pub use linked::UnlinkedFrames;
 pub use opened::Opened;
@@ -50,23 +52,23 @@ use crate::models::opened::InputFormat;
 
 /// Formats that are read from files. The first entry that recognizes a path opens it.
 const INPUT_FORMATS: [InputFormat; 17] = [
-    InputFormat::Model(windowed::FTGS),
-    InputFormat::Model(windowed::TSOG),
-    InputFormat::Model(spacetime_gaussians::ENTRY),
-    InputFormat::Model(spacetime_gaussians::SPLATV),
-    InputFormat::Frames(still_files::ENTRY),
-    InputFormat::Model(sc_gs::ENTRY),
-    InputFormat::Model(deformable_3d_gaussians::ENTRY),
-    InputFormat::Model(native_4d_gaussians::ENTRY),
-    InputFormat::Model(free_time_gs::ENTRY),
-    InputFormat::Model(foreign::ENTRY),
-    InputFormat::Model(static_3d_gaussians::ENTRY),
-    InputFormat::Model(four_d_gaussians::ENTRY),
-    InputFormat::Model(dynamic_3d_gaussians::ENTRY),
-    InputFormat::Frames(ply_sequence::FOLDER),
-    InputFormat::Model(ply_sequence::FILE),
-    InputFormat::Frames(container::ENTRY),
-    InputFormat::Model(archive::ENTRY),
+    windowed::FTGS,
+    windowed::TSOG,
+    spacetime_gaussians::ENTRY,
+    spacetime_gaussians::SPLATV,
+    still_files::ENTRY,
+    sc_gs::ENTRY,
+    deformable_3d_gaussians::ENTRY,
+    native_4d_gaussians::ENTRY,
+    free_time_gs::ENTRY,
+    foreign::ENTRY,
+    static_3d_gaussians::ENTRY,
+    four_d_gaussians::ENTRY,
+    dynamic_3d_gaussians::ENTRY,
+    ply_sequence::FOLDER,
+    ply_sequence::FILE,
+    container::ENTRY,
+    archive::ENTRY,
 ];
 
 /// Returns white if the model in the folder `cameras`, or in the folder of the file `cameras`, was trained with a white
@@ -90,8 +92,8 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Opened> {
     if is_folder {
         refuse_inside_a_model(path)?;
     }
-    match INPUT_FORMATS.iter().find(|format| format.recognizes(&found)) {
-        Some(format) => format.open(path, options),
+    match INPUT_FORMATS.iter().find(|format| (format.recognizes)(&found)) {
+        Some(format) => (format.open)(path, options),
         None if is_folder => Err(unrecognized::unrecognized_folder(path)),
         None if has_legacy_magic(&found.head) => Err(legacy_format(path)),
         None => Err(unrecognized::unrecognized_file(path)),

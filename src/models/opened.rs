@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::linked::UnlinkedFrames;
 use crate::error::Result;
-use crate::models::input_model::{FoundInput, InputModel, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::input_model::{FoundInput, InputModel, OpenOptions, TimeOrigin};
 
 /// Opened input.
 pub enum Opened {
@@ -15,6 +15,11 @@ pub enum Opened {
 }
 
 impl Opened {
+    /// Creates an opened input from a model, or from frames that identify each Gaussian.
+    pub(super) fn from_model(model: impl InputModel + 'static) -> Opened {
+        Opened::Model(Box::new(model))
+    }
+
     /// Returns the model, or `None` if the input consists of frames that are not linked yet.
     pub fn model(&self) -> Option<&dyn InputModel> {
         match self {
@@ -23,22 +28,10 @@ impl Opened {
         }
     }
 
-    /// Returns the input as one of another format: `wrap` is called with the model, after linking if that is needed, and
-    /// returns the model of the other format.
-    pub(super) fn wrapped(
-        self,
-        wrap: impl FnOnce(Box<dyn InputModel>) -> Box<dyn InputModel> + Send + Sync + 'static,
-    ) -> Opened {
-        match self {
-            Opened::Model(model) => Opened::Model(wrap(model)),
-            Opened::Unlinked(frames) => Opened::Unlinked(Box::new(frames.wrapped(wrap))),
-        }
-    }
-
     /// Returns where the time stamps of frames come from.
     pub fn timing(&self) -> TimeOrigin {
         match self {
-            Opened::Model(model) => model.timing(),
+            Opened::Model(model) => model.description().timing,
             Opened::Unlinked(frames) => frames.timing(),
         }
     }
@@ -64,34 +57,14 @@ impl Opened {
     }
 }
 
-/// Format of frames that may have to be linked.
-pub(super) type FrameFormat = ModelFormat<Opened>;
+/// Function that opens the input at a path. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no
+/// frames until frame times are set.
+pub(super) type OpenInput = fn(&Path, &OpenOptions) -> Result<Opened>;
 
-/// Format that is read from files.
-pub(super) enum InputFormat {
-    /// Format of models. They tell which Gaussian is which at every frame.
-    Model(ModelFormat),
-    /// Format of frames. They may have to be linked.
-    Frames(FrameFormat),
-}
-
-impl InputFormat {
-    /// Returns whether the input `found` has this format.
-    pub(super) fn recognizes(&self, found: &FoundInput) -> bool {
-        match self {
-            InputFormat::Model(format) => (format.recognizes)(found),
-            InputFormat::Frames(format) => (format.recognizes)(found),
-        }
-    }
-
-    /// Opens the input at `path`, which has this format.
-    ///
-    /// # Errors
-    /// Fails if a file is damaged, or if an option does not apply to the format.
-    pub(super) fn open(&self, path: &Path, options: &OpenOptions) -> Result<Opened> {
-        match self {
-            InputFormat::Model(format) => (format.open)(path, options).map(Opened::Model),
-            InputFormat::Frames(format) => (format.open)(path, options),
-        }
-    }
+/// Input format: how its files are recognized and opened.
+pub(super) struct InputFormat {
+    /// Returns whether the input has this format, judged by the content of its files.
+    pub(super) recognizes: fn(&FoundInput) -> bool,
+    /// Opens the input.
+    pub(super) open: OpenInput,
 }

@@ -4,14 +4,14 @@
 //! Output files keep the properties, comments and names of the input files.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rayon::prelude::*;
 
 use super::archive::files::add_cloud;
 use super::linked::UnlinkedFrames;
-use super::size::bytes_read_for;
-use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
+use super::size::{ModelSize, file_bytes};
+use super::trajectories::{merged, state_bytes, write_trajectories};
 use crate::archive::ArchiveContent;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
@@ -21,8 +21,8 @@ use crate::files::ply_frames::PlyFrames;
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
 use crate::model::{Attributes, Gaussians};
-use crate::models::input_model::{InputModel, LinkMode, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
-use crate::models::opened::{FrameFormat, Opened};
+use crate::models::input_model::{InputModel, LinkMode, MemoryProfile, ModelDescription, OpenOptions};
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{FramesInMemory, gather_all};
@@ -31,7 +31,7 @@ use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, compare_order};
 
 /// Format of frames in PLY files: recognizes and opens a folder with one PLY file per frame.
-pub(super) const FOLDER: FrameFormat = FrameFormat {
+pub(super) const FOLDER: InputFormat = InputFormat {
     recognizes: |found| found.is_folder && has_ply(found.path),
     open: |path, options| {
         let by = if options.allow_gaps { PlyFrames::open_with_gaps } else { PlyFrames::open };
@@ -48,11 +48,11 @@ fn has_ply(folder: &Path) -> bool {
 }
 
 /// Model format of a single PLY file: recognizes and opens the file, which becomes the only frame.
-pub(super) const FILE: ModelFormat = ModelFormat {
+pub(super) const FILE: InputFormat = InputFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| {
         options.refuse_for(path)?;
-        Ok(Box::new(PlySequence::new(PlyFrames::open_single(path, &options.ply())?)?))
+        Ok(Opened::from_model(PlySequence::open_single(path, &options.ply())?))
     },
 };
 
@@ -67,8 +67,8 @@ pub(super) fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions)
         _ => FrameOrder::Assumed,
     };
     Ok(match order {
-        FrameOrder::Assumed => Opened::Model(Box::new(PlySequence::new(frames)?)),
-        FrameOrder::Confirmed(note) => Opened::Model(Box::new(PlySequence::new(frames)?.with_note(note))),
+        FrameOrder::Assumed => Opened::from_model(PlySequence::new(frames)?),
+        FrameOrder::Confirmed(note) => Opened::from_model(PlySequence::new(frames)?.with_note(note)),
         FrameOrder::Lost(why) => Opened::Unlinked(Box::new(UnlinkedFrames::from_files(frames, path, why, options))),
     })
 }
@@ -137,8 +137,14 @@ fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
 }
 
 impl InputModel for PlySequence {
-    fn kind(&self) -> &'static str {
-        "PLY frames"
+    fn description(&self) -> ModelDescription {
+        ModelDescription {
+            kind: "PLY frames",
+            notes: self.notes().to_vec(),
+            has_explicit_frames: true,
+            archives_as_frames: self.paths().len() > 1,
+            ..ModelDescription::default()
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -149,20 +155,8 @@ impl InputModel for PlySequence {
         PlySequence::digest(self)
     }
 
-    fn notes(&self) -> Vec<String> {
-        PlySequence::notes(self).to_vec()
-    }
-
-    fn bytes(&self) -> Result<u64> {
-        bytes_read_for(self.paths().iter().map(PathBuf::as_path))
-    }
-
-    fn has_explicit_frames(&self) -> bool {
-        true
-    }
-
-    fn archives_as_frames(&self) -> bool {
-        self.paths().len() > 1
+    fn size(&self) -> Result<ModelSize> {
+        Ok(ModelSize::from_frames(file_bytes(self.paths())?))
     }
 
     fn memory_profile(&self) -> MemoryProfile {
@@ -176,19 +170,8 @@ impl InputModel for PlySequence {
         }
     }
 
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Numbered
-    }
-
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(PlySequence::with_times(*self, times)?))
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        match kind {
-            OutputKind::Archive => Ok(()),
-            _ => check_output(self.paths().len(), kind, path),
-        }
     }
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {

@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 use crate::archive::ArchiveSize;
 use crate::error::{Error, Result};
 
+/// Files of a model besides its Gaussians, for [`ModelSize::from_cloud_file`]: none.
+pub(super) const NO_FILES: [&str; 0] = [];
+
 /// Size in bytes of all files of a model that a renderer opens, divided into parts. Files that only training reads are
 /// not counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -32,6 +35,19 @@ impl ModelSize {
     /// Returns the size of a model that consists only of stored frames, which take `frames` bytes.
     pub fn from_frames(frames: u64) -> ModelSize {
         ModelSize { frames, ..ModelSize::default() }
+    }
+
+    /// Returns the size of a model whose canonical Gaussians are in the file `cloud`, and whose other data except the
+    /// deformation field are in the files `rest`. Fails if the size of a file cannot be read.
+    pub(super) fn from_cloud_file(cloud: &Path, rest: impl IntoIterator<Item: AsRef<Path>>) -> Result<ModelSize> {
+        Ok(ModelSize { cloud: file_bytes([cloud])?, rest: file_bytes(rest)?, ..ModelSize::default() })
+    }
+
+    /// Returns the size of an output folder whose canonical Gaussians are in its file `cloud`. Fails if a size cannot be
+    /// read.
+    pub(super) fn from_folder(folder: &Path, cloud: &Path) -> Result<ModelSize> {
+        let cloud = file_bytes([cloud])?;
+        Ok(ModelSize { cloud, rest: bytes_below(folder)?.saturating_sub(cloud), ..ModelSize::default() })
     }
 
     /// Returns the size of the whole model in bytes.
@@ -85,8 +101,8 @@ pub fn format_ratio(after: u64, before: u64) -> String {
 }
 
 /// Returns the sum of the sizes of the files `paths` in bytes. Fails if the size of a file cannot be read.
-pub(super) fn bytes_read_for<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
-    paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
+pub(super) fn file_bytes(paths: impl IntoIterator<Item: AsRef<Path>>) -> Result<u64> {
+    paths.into_iter().map(|path| Ok(fs::metadata(path.as_ref()).map_err(Error::io("read", path.as_ref()))?.len())).sum()
 }
 
 /// Returns the size in bytes of a file, or of all files below a folder.

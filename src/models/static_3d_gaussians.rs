@@ -6,16 +6,17 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use super::cfg_args;
 use super::files::copy;
-use super::four_d_gaussians::cfg_args;
 use super::iterations::find_iteration;
-use super::size::{ModelSize, bytes_below, bytes_read_for};
+use super::size::{ModelSize, file_bytes};
 use crate::archive::ArchiveContent;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, OpenOptions};
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::FrameSource;
@@ -27,7 +28,7 @@ const POINT_CLOUD_FILE: &str = "point_cloud.ply";
 
 /// Model format of 3D Gaussian Splatting: recognizes and opens a model folder with a point cloud file and no
 /// deformation field.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| {
         let is_static =
             |folder: &Path| folder.join(POINT_CLOUD_FILE).is_file() && !folder.join("deformation.pth").exists();
@@ -35,7 +36,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
             find_iteration(&found.path.join(POINT_CLOUD_FOLDER), None).is_ok_and(|(_, folder)| is_static(&folder));
         found.is_folder && is_static_model && !has_deformation(found.path)
     },
-    open: |path, options| Ok(Box::new(StaticModel::open(path, options)?)),
+    open: |path, options| Ok(Opened::from_model(StaticModel::open(path, options)?)),
 };
 
 /// Returns whether `cfg_args` or a file of the model folder shows that its Gaussians are deformed, even if the
@@ -79,8 +80,15 @@ impl StaticModel {
 }
 
 impl InputModel for StaticModel {
-    fn kind(&self) -> &'static str {
-        "3D Gaussian Splatting model"
+    fn description(&self) -> ModelDescription {
+        let has_configuration = self.root.join("cfg_args").exists();
+        ModelDescription {
+            kind: "3D Gaussian Splatting model",
+            notes: self.cloud.notes().to_vec(),
+            default_output_kind: OutputKind::Model,
+            reason_to_keep_sh_degree: has_configuration.then_some("cfg_args fixes the SH degree"),
+            ..ModelDescription::default()
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -91,22 +99,13 @@ impl InputModel for StaticModel {
         self.cloud.digest()
     }
 
-    fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.total())
-    }
-
     fn size(&self) -> Result<ModelSize> {
-        let rest = self.copied_files().collect::<Vec<_>>();
-        let (cloud, rest) = (InputModel::bytes(&self.cloud)?, bytes_read_for(rest.iter().map(PathBuf::as_path))?);
-        Ok(ModelSize { cloud, rest, ..ModelSize::default() })
+        Ok(ModelSize { cloud: self.cloud.bytes()?, rest: file_bytes(self.copied_files())?, ..ModelSize::default() })
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
-            OutputKind::Model => {
-                let cloud = bytes_read_for([&*self.cloud_path(path)])?;
-                Ok(ModelSize { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..ModelSize::default() })
-            }
+            OutputKind::Model => ModelSize::from_folder(path, &self.cloud_path(path)),
             _ => self.cloud.size_written(kind, path),
         }
     }
@@ -115,31 +114,8 @@ impl InputModel for StaticModel {
         self.cloud.memory_profile()
     }
 
-    fn notes(&self) -> Vec<String> {
-        self.cloud.notes().to_vec()
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Numbered
-    }
-
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(StaticModel { cloud: self.cloud.with_times(times)?, ..*self }))
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        OutputKind::Model
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        match kind {
-            OutputKind::Model => Ok(()),
-            _ => self.cloud.check_output(kind, path),
-        }
-    }
-
-    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
-        self.root.join("cfg_args").exists().then_some("cfg_args fixes the SH degree")
     }
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
@@ -181,6 +157,7 @@ mod tests {
     use crate::files::ply::write::write_inria;
     use crate::model::{Attributes, Gaussians};
     use crate::models;
+    use crate::models::size::bytes_below;
     use crate::passes::gather_all;
     use crate::recipe::Recipe;
 
@@ -201,7 +178,10 @@ mod tests {
                 .and_then(models::Opened::into_linked)
         };
         let model = open(&root, None).unwrap();
-        assert_eq!((model.kind(), model.default_output_kind()), ("3D Gaussian Splatting model", OutputKind::Model));
+        assert_eq!(
+            (model.description().kind, model.description().default_output_kind),
+            ("3D Gaussian Splatting model", OutputKind::Model)
+        );
         let result = folder.path().join("result");
         fs::create_dir(&result).unwrap();
         let compressed = CompressedModel::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
@@ -225,6 +205,6 @@ mod tests {
             assert!(message.contains("deform.pth") && message.contains("no such folder"), "{message}");
         }
         fs::write(root.join("cfg_args"), "Namespace(sh_degree=3, deform_type='static')").unwrap();
-        assert_eq!(open(&root, None).unwrap().kind(), "3D Gaussian Splatting model");
+        assert_eq!(open(&root, None).unwrap().description().kind, "3D Gaussian Splatting model");
     }
 }

@@ -19,15 +19,15 @@ use crossbeam_channel::bounded;
 use gseq::Compression;
 
 use crate::error::{Error, Result};
-use crate::files::atomic::ScratchFile;
+use crate::files::atomic::ScratchFolder;
 use crate::files::container::Container;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::model::Gaussians;
-use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
+use crate::models::input_model::InputModel;
+use crate::models::unpacked::{Original, Unpacked};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, Packing};
 use crate::passes::FramesInMemory;
 use crate::progress::Events;
-use crate::source::FrameSource;
 
 /// Maximum bytes of received frames that are kept in memory together; at least one frame is kept.
 const HELD_BYTES: u64 = 64 << 20;
@@ -37,79 +37,22 @@ pub const PREFETCH_FRAMES: usize = 2;
 /// container into which `convert` writes it have the same digest (hash of the input).
 const COMPRESSION: Compression = Compression::Zstd(1);
 
-/// Frame stream that was received completely.
-pub struct ReceivedStream {
-    /// Temporary container of the received frames.
-    container: Container,
-    /// Number of bytes received from the stream.
-    received: u64,
-    /// Owner of the container's file; deletes the file when it is dropped.
-    _scratch: ScratchFile,
-}
-
-impl ReceivedStream {
-    /// Receives a stream, packs it into a temporary container in `folder`, and returns the received stream, whose
-    /// frames are read from this container. Calls `take` with the frames of each block of consecutive frames, in order.
-    ///
-    /// # Errors
-    /// Fails if the stream is damaged or a write fails.
-    pub fn receive_and_pack(
-        stream: FrameStream<impl Read + Send + 'static>,
-        folder: &Path,
-        events: &Events,
-        take: impl FnMut(&FramesInMemory) -> Result<()>,
-    ) -> Result<ReceivedStream> {
-        let scratch = ScratchFile::new(folder)?;
-        let received = pack_stream(stream, scratch.path(), COMPRESSION, events, take)?;
-        let container = Container::open(scratch.path())?;
-        Ok(ReceivedStream { container, received, _scratch: scratch })
-    }
-}
-
-impl InputModel for ReceivedStream {
-    fn kind(&self) -> &'static str {
-        "frame stream"
-    }
-
-    fn source(&self) -> &dyn FrameSource {
-        &self.container
-    }
-
-    fn digest(&self) -> Result<String> {
-        InputModel::digest(&self.container)
-    }
-
-    fn bytes(&self) -> Result<u64> {
-        Ok(self.received)
-    }
-
-    fn stored_bytes(&self) -> Result<u64> {
-        self.container.bytes()
-    }
-
-    fn may_be_linked(&self) -> bool {
-        true
-    }
-
-    fn has_explicit_frames(&self) -> bool {
-        true
-    }
-
-    fn memory_profile(&self) -> MemoryProfile {
-        self.container.memory_profile()
-    }
-
-    fn hold_decoded(&self) {
-        InputModel::hold_decoded(&self.container);
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Stamped
-    }
-
-    fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        Err(Error::usage("a frame stream contains the times of its frames; no other times can be given"))
-    }
+/// Receives a stream, packs it into a temporary container in `folder`, and returns the received stream as a model, whose
+/// frames are read from this container. Calls `take` with the frames of each block of consecutive frames, in order.
+///
+/// # Errors
+/// Fails if the stream is damaged or a write fails.
+pub fn receive_and_pack(
+    stream: FrameStream<impl Read + Send + 'static>,
+    folder: &Path,
+    events: &Events,
+    take: impl FnMut(&FramesInMemory) -> Result<()>,
+) -> Result<Box<dyn InputModel>> {
+    let scratch = ScratchFolder::new(folder)?;
+    let path = scratch.path().join("frames.gseq");
+    let received = pack_stream(stream, &path, COMPRESSION, events, take)?;
+    let original = Original::Stamped(received);
+    Ok(Unpacked { _scratch: scratch, kind: "frame stream", original }.into_model(Box::new(Container::open(&path)?)))
 }
 
 /// Receives a stream, writes its frames to the container `path` with the settings `packing`, and returns the number of

@@ -60,15 +60,14 @@ pub(super) fn compressed_trajectories<'a>(
     Box::new(SourceWithDeltas::new(Box::new(merged(source, compressed)), delta, trajectory_delta, *sh_degree))
 }
 
-/// Fails if a sequence of `frames` frames cannot be written as the kind of output `kind` to `path`. The message says
-/// which kinds of output work.
+/// Fails if a sequence of `frames` frames cannot be written as the kind of output `kind` to `path`, except for kinds that
+/// hold a single frame ([`OutputKind::check_frames`]). The message says which kinds of output work.
 pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Result<()> {
     match kind {
         OutputKind::Model => Err(Error::usage(
             "only a trained model can be written as a model folder\n  write a .gseq or --as ply-sequence",
         )),
         OutputKind::Ply if frames != 1 => Err(too_many_frames(frames, "ply", "a .gseq or --as ply-sequence", path)),
-        OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
         _ => Ok(()),
     }
 }
@@ -79,10 +78,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
 /// Fails if it cannot be written; the message lists kinds of output that work.
 pub fn check_frames_output(frames: usize, kind: OutputKind, path: &Path) -> Result<()> {
     kind.check_frames(frames, path)?;
-    match kind {
-        OutputKind::Archive => Ok(()),
-        _ => check_output(frames, kind, path),
-    }
+    check_output(frames, kind, path)
 }
 
 /// Writes the compressed model `compressed` of `source` as the kind of output `kind` to `path`; returns notes for the

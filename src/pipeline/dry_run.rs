@@ -97,7 +97,7 @@ pub fn dry_run(request: &Request) -> Result<DryRunReport> {
         tool: TOOL.to_owned(),
         dry_run: true,
         path: scene.path.to_string_lossy().into_owned(),
-        kind: scene.input.kind().to_owned(),
+        kind: scene.input.description().kind.to_owned(),
         gaussians_in: info.count,
         frames: info.times.len(),
         sh_degree: info.sh_degree,

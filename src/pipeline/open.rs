@@ -23,7 +23,7 @@ use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload, format_bytes};
 use crate::model::RobustBox;
 use crate::model::{Camera, FrameView, Rig, Split, ViewSchedule};
 use crate::models::Opened;
-use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
+use crate::models::stream::{PREFETCH_FRAMES, frames_per_tile, receive_and_pack};
 use crate::passes::{FramesInMemory, ViewSampler};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
@@ -188,7 +188,7 @@ fn receive_measured(
         let _ = rig.set(loaded);
     }
     let mut measuring: Option<Measuring<'_>> = None;
-    let streamed = ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| {
+    let streamed = receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| {
         quota.count_arrived(held.len())?;
         if quota.arrived() > to_measure {
             measuring = None;
@@ -208,7 +208,7 @@ fn receive_measured(
     })?;
     let frames_arrived = quota.arrived();
     let rig_given = rig.get().filter(|_| has_cameras).cloned();
-    let opened = with_cameras(options, Opened::Model(Box::new(streamed)), rig_given)?;
+    let opened = with_cameras(options, Opened::Model(streamed), rig_given)?;
     let mut scene = from_input(opened.track(&options.path)?, options)?;
     // The number of frames is known now.
     let (now, counted) = (scene.workload(), Budget { tell: Verbosity::Nothing, ..options.memory });

@@ -27,8 +27,8 @@ impl InputMeta {
         InputMeta {
             gaussians: scene.source().info().count,
             has_cameras: scene.has_cameras,
-            archives_as_frames: scene.input.archives_as_frames(),
-            default_output_kind: scene.input.default_output_kind(),
+            archives_as_frames: scene.input.description().archives_as_frames,
+            default_output_kind: scene.input.description().default_output_kind,
         }
     }
 

@@ -133,7 +133,7 @@ impl InputSummary {
         let info = input.source().info();
         Ok(InputSummary {
             path: path.to_string_lossy().into_owned(),
-            kind: input.kind().to_owned(),
+            kind: input.description().kind.to_owned(),
             digest,
             gaussians: info.count,
             frames: Some(info.times.len()),

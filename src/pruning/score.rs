@@ -354,7 +354,9 @@ impl Scored {
     /// not mentioned.
     fn record(&self, scene: &Scene, median_life: u32, is_partial: bool, journal: &mut Journal) {
         let info = scene.source().info();
-        if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE_RATIO).contains(&(median_life as usize)) {
+        if scene.input.description().may_be_linked
+            && (1..=info.times.len() / SHORT_LIFE_RATIO).contains(&(median_life as usize))
+        {
             journal.notes.push(format!(
                 "Gaussians are alive in {median_life} of {} frames (median): --link always joins Gaussians that \
                  continue one another",

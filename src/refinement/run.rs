@@ -328,7 +328,7 @@ impl<'a> RefineRun<'a> {
     /// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame); 0 if the
     /// added values are constant in time, as for inputs without explicit frames.
     fn keyframe_count(&self) -> usize {
-        match self.scene.input.has_explicit_frames() {
+        match self.scene.input.description().has_explicit_frames {
             true => keyframe_count(self.refine.keyframes, self.scene.source().info().times.len()),
             false => 0,
         }

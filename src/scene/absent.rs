@@ -61,10 +61,6 @@ impl BlockReader for HidingReader<'_> {
     fn expect(&mut self, plan: &ReadPlan) {
         self.reader.expect(plan);
     }
-
-    fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {
-        self.reader.prepare(frame, want)
-    }
 }
 
 /// Makes the Gaussian in row `row` of `state` invisible by overwriting its attributes `want`: position NaN (which lies

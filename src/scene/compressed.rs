@@ -42,8 +42,9 @@ pub fn open_compressed(
 ) -> Result<(Box<dyn InputModel>, Option<String>)> {
     let own_times = &original.source().info().times;
     let input = models::open(path, &OpenOptions { iteration: None, ..options.open_options() })?.into_linked()?;
+    let description = input.description();
     let is_fitted_splatv =
-        input.default_output_kind() == OutputKind::Splatv && !original.input.keeps_motion(OutputKind::Splatv);
+        description.default_output_kind == OutputKind::Splatv && !original.input.keeps_motion(OutputKind::Splatv);
     let times = &if is_fitted_splatv { scale_to_unit(own_times) } else { own_times.clone() };
     let note = match &own_times[..] {
         [first, .., last] if times != own_times => Some(format!(
@@ -53,7 +54,7 @@ pub fn open_compressed(
         )),
         _ => None,
     };
-    let input = match input.timing() {
+    let input = match description.timing {
         TimeOrigin::Continuous => input.with_times(times.clone())?,
         TimeOrigin::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,
         TimeOrigin::Numbered | TimeOrigin::Stamped => input,
@@ -80,7 +81,7 @@ pub fn open_compressed(
 /// Returns a note for each of the two models whose frames were linked, so that its renders differ from those of its
 /// input files.
 pub fn tracking_notes(original: &dyn InputModel, compressed: &dyn InputModel) -> impl Iterator<Item = String> {
-    [("original", original.tracking_note()), ("compressed", compressed.tracking_note())]
+    [("original", original.description().tracking_note), ("compressed", compressed.description().tracking_note)]
         .into_iter()
         .filter_map(|(role, note)| Some(format!("the {role} model: {}", note?)))
 }

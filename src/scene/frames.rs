@@ -4,7 +4,7 @@
 use super::Scene;
 use crate::error::Result;
 use crate::model::SequenceInfo;
-use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadCounts, ReadPlan};
+use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, ReadCounts, ReadPlan};
 
 impl Scene {
     /// Makes the Gaussians with the ids `ids` (in increasing order) invisible in all later reads of the scene's frames.
@@ -46,10 +46,6 @@ impl FrameSource for Scene {
 
     fn reads(&self) -> ReadCounts {
         self.input.source().reads()
-    }
-
-    fn prefetcher(&self) -> Option<&dyn Prefetch> {
-        self.input.source().prefetcher()
     }
 }
 

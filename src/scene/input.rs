@@ -148,7 +148,7 @@ impl UntrackedInput {
             return Err(Error::input(path, "", "at least one frame", found));
         }
         // Some notes of the input depend on the times of its frames.
-        let notes = [input.notes(), notes].concat();
+        let notes = [input.description().notes, notes].concat();
         Ok(OpenedInput { input, rig, notes })
     }
 }
@@ -171,12 +171,13 @@ pub(super) fn load_cameras(
     input: Option<&dyn InputModel>,
 ) -> Result<Option<Rig>> {
     let Some(path) = path else { return Ok(None) };
-    let frames = input.and_then(InputModel::data_frames).or(options.frames);
+    let description = input.map(InputModel::description);
+    let frames = description.as_ref().and_then(|found| found.data_frames).or(options.frames);
     let rig = cameras::load(
         path,
         &CameraOptions { size: options.size, frames, times, clock, memory: options.memory.read_limit() },
     )?;
-    let has_frame_states = input.is_none_or(InputModel::has_explicit_frames);
+    let has_frame_states = description.is_none_or(|found| found.has_explicit_frames);
     let trained_background = || has_frame_states.then(|| models::trained_background(path)).flatten();
     Ok(Some(Rig { background: rig.background.or_else(trained_background), ..rig }))
 }
@@ -184,7 +185,10 @@ pub(super) fn load_cameras(
 /// Returns the path of the cameras: the one that `options` name, else that of the training cameras of `model`. Returns
 /// `None` if there is neither.
 pub(super) fn camera_path(options: &InputOptions, model: Option<&dyn InputModel>) -> Option<PathBuf> {
-    options.cameras.clone().or_else(|| cameras::find_training_cameras(model?.data_folder()?, &options.path))
+    options
+        .cameras
+        .clone()
+        .or_else(|| cameras::find_training_cameras(&model?.description().data_folder?, &options.path))
 }
 
 /// Returns the input `opened`, whose frames keep their times, with its cameras `rig`, if it has any. The cameras must

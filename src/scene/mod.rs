@@ -94,13 +94,14 @@ impl Scene {
     /// # Errors
     /// Fails if a camera has a time that is not the time of any frame.
     pub fn new(path: PathBuf, input: Box<dyn InputModel>, rig: Rig, split: Option<Split>) -> Result<Scene> {
-        let schedule = rig.schedule(&input.source().info().times, split).map_err(|error| match input.timing() {
-            TimeOrigin::Continuous => {
-                Error::usage(format!("{error}, or set --frames to the number of times in the camera file"))
-            }
-            TimeOrigin::Numbered | TimeOrigin::Stamped => error,
-        })?;
-        let background = rig.background.or(input.background()).unwrap_or([0.0; 3]);
+        let schedule =
+            rig.schedule(&input.source().info().times, split).map_err(|error| match input.description().timing {
+                TimeOrigin::Continuous => {
+                    Error::usage(format!("{error}, or set --frames to the number of times in the camera file"))
+                }
+                TimeOrigin::Numbered | TimeOrigin::Stamped => error,
+            })?;
+        let background = rig.background.or(input.description().background).unwrap_or([0.0; 3]);
         Ok(Scene {
             path,
             input,

@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use super::Scene;
 use super::input::{InputOptions, OpenedInput, UntrackedInput, camera_path, has_one_frame, load_cameras, with_cameras};
-use super::stream::open_packed_stream;
+use super::stream::{load_stream_cameras, open_stream, receive_untracked};
 use super::view_selection::no_view_error;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
@@ -14,7 +14,7 @@ use crate::files::cameras::{TimeConvention, TimesSource};
 use crate::model::RobustBox;
 use crate::model::{Attributes, Rig, opacity};
 use crate::models;
-use crate::models::{InputModel, Opened, TimeOrigin};
+use crate::models::{Opened, TimeOrigin};
 use crate::passes::gather_all;
 use crate::progress::Message;
 use crate::source::FrameSource;
@@ -37,7 +37,8 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
 pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
     options.check_folders()?;
     if options.is_stream() {
-        return open_packed_stream(options);
+        let rig = load_stream_cameras(options)?;
+        return receive_untracked(open_stream(options)?, rig, options);
     }
     let path = &options.path;
     let opened = models::open(path, &options.open_options())?;
@@ -49,7 +50,9 @@ pub fn open_untracked(options: &InputOptions) -> Result<UntrackedInput> {
             None if !times.is_empty() => times,
             // The given number of frames equals the number of the cameras' times, so these times are used.
             Some(frames) if frames == times.len() => times,
-            given => evenly_spaced(given, opened.model().map_or(1.0, InputModel::duration), &mut notes)?,
+            given => {
+                evenly_spaced(given, opened.model().map_or(1.0, |model| model.description().duration), &mut notes)?
+            }
         }),
         _ if options.frames.is_some() => {
             return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.shown())));
@@ -82,7 +85,7 @@ fn load_input_cameras(options: &InputOptions, opened: &Opened) -> Result<Option<
         TimesSource::Own if has_one_frame(opened) && by_name => TimesSource::None,
         _ => options.times.clone(),
     };
-    let clock = model.map_or(TimeConvention::Normalized, InputModel::time_convention);
+    let clock = model.map_or(TimeConvention::Normalized, |model| model.description().time_convention);
     load_cameras(options, path.as_deref(), times, clock, model)
 }
 

@@ -11,9 +11,8 @@ use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, Rig};
-use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
-use crate::models::{LinkMode, MemoryProfile};
-use crate::models::{Opened, UnlinkedFrames};
+use crate::models::stream::{PREFETCH_FRAMES, frames_per_tile, receive_and_pack};
+use crate::models::{InputModel, LinkMode, MemoryProfile, Opened, UnlinkedFrames};
 use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::statistics;
 
@@ -65,15 +64,6 @@ pub fn load_stream_cameras(options: &InputOptions) -> Result<Option<Rig>> {
     load_cameras(options, options.cameras.as_deref(), options.times.clone(), TimeConvention::Normalized, None)
 }
 
-/// Opens the stream on standard input together with its cameras, as [`receive_untracked`] does.
-///
-/// # Errors
-/// Fails as [`receive_untracked`] does, or if the cameras are invalid.
-pub(super) fn open_packed_stream(options: &InputOptions) -> Result<UntrackedInput> {
-    let rig = load_stream_cameras(options)?;
-    receive_untracked(open_stream(options)?, rig, options)
-}
-
 /// Receives a stream of frames completely. Its Gaussians still have to be linked into tracks (Gaussians followed through
 /// frames) if [`is_linked`] says so. `rig`: cameras from [`load_stream_cameras`].
 ///
@@ -87,7 +77,7 @@ pub fn receive_untracked(
 ) -> Result<UntrackedInput> {
     let opened = match is_linked(stream.header(), options) {
         true => Opened::Unlinked(Box::new(receive_unlinked(stream, options)?)),
-        false => Opened::Model(Box::new(pack_stream(stream, options)?)),
+        false => Opened::Model(pack_stream(stream, options)?),
     };
     with_cameras(options, opened, rig)
 }
@@ -97,11 +87,9 @@ pub fn receive_untracked(
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (consecutive frames
 /// that the container stores together).
-fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<ReceivedStream> {
+fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Box<dyn InputModel>> {
     let mut quota = frame_quota(options, stream.header())?;
-    ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| {
-        quota.count_arrived(held.len())
-    })
+    receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| quota.count_arrived(held.len()))
 }
 
 /// Returns whether Gaussians of successive frames are linked into tracks (Gaussians followed through frames): if the
@@ -122,7 +110,7 @@ fn receive_unlinked(stream: FrameStream<Stdin>, options: &InputOptions) -> Resul
     let open = options.open_options();
     match stream.header().is_unlinked {
         true => UnlinkedFrames::receive(stream, Path::new(STANDARD_INPUT), &open),
-        false => Ok(UnlinkedFrames::from_model(Box::new(pack_stream(stream, options)?), "linked frame stream", &open)),
+        false => Ok(UnlinkedFrames::from_model(pack_stream(stream, options)?, "linked frame stream", &open)),
     }
 }
 

@@ -77,7 +77,7 @@ pub fn open_cache(options: &InputOptions, input: &dyn InputModel) -> Result<(Cac
         &info.times,
         info.sh_degree,
         info.varying.bits(),
-        input.kind(),
+        input.description().kind,
     )));
     Ok((work, Some(digest)))
 }

@@ -2,7 +2,6 @@
 //! threads.
 
 pub(crate) mod blocks;
-pub(crate) mod staged;
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -34,12 +33,11 @@ pub struct ScanResult {
 }
 
 /// Scans all frames of `source`: computes the statistics of all Gaussians, as seen by the cameras of `schedule`. Blocks
-/// of Gaussians are processed in parallel, or by the stages of a pipeline if the source is slow to read
-/// ([`FrameSource::prefetcher`]).
+/// of Gaussians are processed in parallel.
 ///
 /// Memory: one row of statistics per Gaussian (twice while blocks are joined), and 4 bytes per frame. Per thread: the
 /// accumulators of one block of Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its attributes at one
-/// frame, and its reader (two readers in a pipeline).
+/// frame, and its reader.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -67,10 +65,7 @@ pub fn scan_blocks(
         info.count.min(blocks.end * GAUSSIANS_PER_BLOCK) - info.count.min(blocks.start * GAUSSIANS_PER_BLOCK);
     let progress = events.task("scan", "states", gaussians as u64 * frames as u64);
     let scan = BlockScans { source, schedule, plan, blocks, progress, alive: Mutex::new(vec![0; frames]) };
-    let blocks = match source.prefetcher() {
-        Some(ahead) if frames > 0 => staged::scan_in_stages(&scan, ahead)?,
-        _ => (0..scan.blocks()).into_par_iter().map(|block| scan.block(block)).collect::<Result<_>>()?,
-    };
+    let blocks: Vec<_> = scan.blocks.clone().into_par_iter().map(|block| scan.block(block)).collect::<Result<_>>()?;
     Ok(joined(blocks, scan.alive.into_inner().unwrap_or_else(PoisonError::into_inner)))
 }
 

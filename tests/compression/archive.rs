@@ -75,7 +75,7 @@ fn archive_reads_like_the_folder_it_unpacks_to() {
     let folder = model(&workplace.path("small"));
     let archive =
         splatsieve::models::open(&workplace.path("small.gsz"), &Default::default()).unwrap().into_linked().unwrap();
-    assert_eq!(archive.kind(), "gsz archive");
+    assert_eq!(archive.description().kind, "gsz archive");
     let archive = archive.with_times(vec![0.0, 0.4, 1.0]).unwrap();
     for frame in 0..3 {
         let (a, b) = (state(archive.source(), frame), state(InputModel::source(&folder), frame));
@@ -145,7 +145,7 @@ fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
         splatsieve::models::open(&workplace.path(name), &Default::default()).unwrap().into_linked().unwrap()
     };
     let [before, after] = ["exact.gseq", "small.gsz"].map(open);
-    assert_eq!(after.kind(), "gseq container");
+    assert_eq!(after.description().kind, "gseq container");
     for frame in [0, 7, 19] {
         let [before, after] = [&before, &after].map(|input| state(input.source(), frame));
         for column in Attributes::all().iter() {

@@ -105,7 +105,7 @@ fn compressed_states_equal_written_states_after_any_delta() {
                 assert!(reduced == written, "a field in half precision differs from what was promised");
                 compressed.field = FieldPrecision::Exact;
             }
-            if input.reason_to_keep_sh_degree().is_none() {
+            if input.description().reason_to_keep_sh_degree.is_none() {
                 for sh_degree in 0..input.source().info().sh_degree {
                     compressed.sh_degree = sh_degree;
                     let [reduced, written] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);

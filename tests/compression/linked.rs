@@ -97,7 +97,7 @@ fn tracks_hold_every_row_of_unlinked_frames_to_the_bit() {
             break;
         }
     }
-    let notes = scene.input.notes().join("\n");
+    let notes = scene.input.description().notes.join("\n");
     assert!(notes.contains("frames were linked: ") && notes.contains(&format!("are {lived} tracks")), "{notes}");
 }
 
@@ -111,7 +111,7 @@ fn frames_are_linked_if_rows_differ_or_on_request() {
         workplace.ply(&format!("mixed/{t}.ply"), &mixed);
         workplace.ply(&format!("kept/{t}.ply"), &mixed.pick(&back));
     }
-    let kind = |folder: &str, link| open(&workplace, folder, link).input.kind();
+    let kind = |folder: &str, link| open(&workplace, folder, link).input.description().kind;
     assert_eq!(kind("kept", LinkMode::Auto), "PLY frames");
     assert_eq!(kind("mixed", LinkMode::Auto), "linked PLY frames");
     assert_eq!(kind("mixed", LinkMode::Never), "PLY frames");
@@ -188,13 +188,13 @@ fn lives_that_fade_into_one_another_become_one_track() {
     let (apart, joined) = (open(&workplace, "frames", LinkMode::Apart), open(&workplace, "frames", LinkMode::Auto));
     let [apart_count, joined_count] = [&apart, &joined].map(|scene| scene.source().info().count);
     assert!(apart_count > 2 * count && joined_count <= count + count / 20, "{apart_count}, {joined_count}");
-    let notes = joined.input.notes().join("\n");
+    let notes = joined.input.description().notes.join("\n");
     assert!(
         notes.contains(&format!("{apart_count} tracks with a median length of "))
             && notes.contains("dB PSNR, mean of renders"),
         "{notes}"
     );
-    assert!(!apart.input.notes().join("\n").contains("were joined"));
+    assert!(!apart.input.description().notes.join("\n").contains("were joined"));
     // One row has the opacity of both.
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
     let mut one_row = 0;
@@ -338,7 +338,7 @@ fn steady_attributes_of_a_track_become_their_mean() {
         }
     }
     assert!(parts.iter().flatten().all(|&part| part > 20), "{parts:?}");
-    let notes = held.input.notes().join("\n");
+    let notes = held.input.description().notes.join("\n");
     assert!(notes.contains("% of the colors (within 0.04)") && notes.contains("dB PSNR, mean of renders"), "{notes}");
     // The written files have the same values, to the bit.
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
@@ -422,7 +422,7 @@ fn cut_begins_new_tracks_and_is_noted() {
     }
     let scene = open(&workplace, "frames", LinkMode::Apart);
     assert_eq!(scene.source().info().count, 600);
-    let notes = scene.input.notes().join("\n");
+    let notes = scene.input.description().notes.join("\n");
     assert!(notes.contains("a cut at 5.ply"), "{notes}");
 }
 
@@ -557,7 +557,10 @@ fn lives_in_containers_and_streams_join_on_request() {
     let [auto, apart, joined] =
         [LinkMode::Auto, LinkMode::Apart, LinkMode::Always].map(|link| open(&workplace, "lives.gseq", link));
     let [auto_count, apart_count, joined_count] = [&auto, &apart, &joined].map(|scene| scene.source().info().count);
-    assert_eq!((auto.input.kind(), joined.input.kind()), ("gseq container", "linked gseq container"));
+    assert_eq!(
+        (auto.input.description().kind, joined.input.description().kind),
+        ("gseq container", "linked gseq container")
+    );
     assert!(auto_count > 4 * count && apart_count > 4 * count, "{auto_count}, {apart_count}");
     assert!((count..=count + count / 20).contains(&joined_count), "{joined_count}");
     assert_eq!(joined.source().info().times, auto.source().info().times);
@@ -631,6 +634,6 @@ fn doubtful_links_begin_new_tracks_and_are_noted() {
         order.sort_by_key(|&i| hash_id(u64::from(i) << 20 | t as u64));
         workplace.ply(&format!("tiny/{t}.ply"), &state(scene.source(), t).pick(&order));
     }
-    let notes = open(&workplace, "tiny", LinkMode::Auto).input.notes().join("\n");
+    let notes = open(&workplace, "tiny", LinkMode::Auto).input.description().notes.join("\n");
     assert!(notes.contains("links were ambiguous"), "{notes}");
 }

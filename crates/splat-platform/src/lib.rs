@@ -16,7 +16,6 @@
 //! | [`FolderStatus::is_own`], [`FolderStatus::is_private`] | owner and mode | as on Linux | always false |
 //! | [`create_private_folder`] | mode 0700 | as on Linux | permissions of the parent |
 //! | [`sync_file`], [`sync_folder`] | both | both | files only |
-//! | [`is_cached`] | `preadv2` | unknown | unknown |
 //! | [`prefetch_pages`], [`release_pages`] | advice on pages | advice on pages | no effect: the system decides |
 //! | [`end_on_signals`] | SIGINT, SIGTERM, SIGHUP | as on Linux | Ctrl+C, Ctrl+Break, closed console |
 //! | [`report_truncated_maps`] | SIGBUS handler | no effect | no effect: a mapped file cannot be truncated |
@@ -64,13 +63,9 @@ mod windows;
 compile_error!("this system is not supported: expected Linux, macOS or Windows");
 
 #[cfg(target_os = "linux")]
-pub use linux::{
-    is_cached, memory_limits, peak_memory_bytes, report_truncated_maps, reset_peak_memory, return_freed_memory,
-};
+pub use linux::{memory_limits, peak_memory_bytes, report_truncated_maps, reset_peak_memory, return_freed_memory};
 #[cfg(target_os = "macos")]
-pub use macos::{
-    is_cached, memory_limits, peak_memory_bytes, report_truncated_maps, reset_peak_memory, return_freed_memory,
-};
+pub use macos::{memory_limits, peak_memory_bytes, report_truncated_maps, reset_peak_memory, return_freed_memory};
 #[cfg(unix)]
 pub use unix::{
     FolderHandle, change_time, create_private_folder, end_on_signals, is_standard_output, is_system_folder,
@@ -79,7 +74,7 @@ pub use unix::{
 };
 #[cfg(windows)]
 pub use windows::{
-    FolderHandle, change_time, create_private_folder, end_on_signals, is_cached, is_standard_output, is_system_folder,
+    FolderHandle, change_time, create_private_folder, end_on_signals, is_standard_output, is_system_folder,
     memory_limits, open_stream, open_without_waiting, peak_memory_bytes, prefetch_pages, private_permissions,
     read_exact_at, release_pages, report_truncated_maps, reset_peak_memory, return_freed_memory, sync_file,
     sync_folder,

@@ -1,17 +1,11 @@
 //! Implementation for macOS: memory limits, and functions that have no effect because macOS does not support them. The
 //! code is type-checked but not tested.
 
-use std::fs::File;
 use std::mem::{MaybeUninit, size_of};
 
 use rustix::process::{Resource, getrlimit};
 
 use crate::{LimitSource, MemoryLimit, MemoryLimits, TruncatedMapMessage};
-
-/// Returns `None`, because macOS does not tell whether reading the byte at `offset` needs disk access.
-pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
-    None
-}
 
 /// Does nothing. macOS gives a process no information on the file that a page belongs to, so the signal SIGBUS, sent
 /// after a mapped file was truncated, ends the process.

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::tiles::KeptColumn;
 use super::*;
+use crate::model::Attributes;
 use crate::model::Gaussians;
 use crate::model::hash_id;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};

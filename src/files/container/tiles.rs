@@ -385,22 +385,6 @@ impl BlockReader for TileReader<'_> {
         self.kept.fill_with(|| KeptColumn::Nothing);
         self.source.reader.release(&mut self.raw_in_use);
     }
-
-    fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {
-        self.check(frame)?;
-        if self.len > 0 {
-            // Record the block as announced, because the caller of `prepare` fetches the next tiles itself.
-            self.announced_block = Some(self.frame_block(frame));
-            self.enter_frame_block(frame);
-            for index in 0..self.kept.len() {
-                if want.contains(self.source.places[index].0) {
-                    self.try_keep(index, frame)?;
-                }
-            }
-            self.source.reader.release(&mut self.decoded);
-        }
-        Ok(())
-    }
 }
 
 impl Drop for TileReader<'_> {

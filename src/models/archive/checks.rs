@@ -66,8 +66,15 @@ pub(in crate::models) fn check_round_trip(
     }
     unpack(&decoded, &file, &restored).unwrap();
     let [restored, opened] = [&restored, &file].map(|path| open(path));
-    assert_eq!(restored.kind(), if kind == model.default_output_kind() { model.kind() } else { restored.kind() });
-    assert_eq!((opened.kind(), opened.default_output_kind()), ("gsz archive", kind));
+    assert_eq!(
+        restored.description().kind,
+        if kind == model.description().default_output_kind {
+            model.description().kind
+        } else {
+            restored.description().kind
+        }
+    );
+    assert_eq!((opened.description().kind, opened.description().default_output_kind), ("gsz archive", kind));
 
     let expected = states(&*model.compressed_frames(compressed).unwrap());
     let shown = states(&*model.decode_frames(&decoded).unwrap());

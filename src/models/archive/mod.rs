@@ -22,36 +22,27 @@ use xxhash_rust::xxh3::xxh3_128;
 use files::{CFG_ARGS, ITERATION, write_cloud};
 use layout::Layout;
 
-use super::size::ModelSize;
 use super::{
     deformable_3d_gaussians, dynamic_3d_gaussians, four_d_gaussians, free_time_gs, native_4d_gaussians, ply_sequence,
     sc_gs, spacetime_gaussians, windowed,
 };
 use crate::archive::{self, ArchiveContent, ArchiveSize};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
-use crate::files::cameras::TimeConvention;
 use crate::files::open::open_file;
-use crate::limits::{Limits, ReadLimit};
-use crate::model::Gaussians;
-use crate::models::input_model::{
-    ColumnInfo, FoundInput, InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin,
-};
+use crate::limits::ReadLimit;
+use crate::models::input_model::{FoundInput, OpenOptions};
+use crate::models::opened::{InputFormat, Opened};
+use crate::models::unpacked::{Original, Unpacked};
 use crate::outputs::kind::OutputKind;
-use crate::progress::Events;
-use crate::recipe::MergeParams;
-use crate::source::FrameSource;
 
 /// Model format of archives of compressed models (`.gsz`): recognizes and opens a file.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
-    recognizes: |found| found.is_file_of(&archive::MAGIC, "gsz"),
-    open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
-};
+pub(super) const ENTRY: InputFormat =
+    InputFormat { recognizes: |found| found.is_file_of(&archive::MAGIC, "gsz"), open };
 
 /// Model formats whose files an archive stores together with a layout, which states how each file is restored. The
 /// first of these formats that recognizes the restored files opens them.
-const FORMATS_WITH_LAYOUT: [ModelFormat; 8] = [
+const FORMATS_WITH_LAYOUT: [InputFormat; 8] = [
     windowed::FTGS,
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
@@ -127,45 +118,34 @@ pub fn holds_model_folder(content: &ArchiveContent) -> bool {
     content.files.contains_key(CFG_ARGS)
 }
 
-/// Opened archive, decoded into a temporary folder.
-struct OpenArchive {
-    /// Model opened from the files in the folder `scratch`.
-    inner: Box<dyn InputModel>,
-    scratch: ScratchFolder,
-    digest: String,
-    size: ModelSize,
-}
-
-impl OpenArchive {
-    /// Reads the archive at `path`, writes its files to a temporary folder and opens them.
-    fn open(path: &Path, options: &OpenOptions) -> Result<OpenArchive> {
-        options.refuse_for(path)?;
-        let bytes = load(path, options.memory)?;
-        let (content, parts) = archive::decode(&bytes, path, options.memory)?;
-        let digest = format!("{:032x}", xxh3_128(&bytes));
-        drop(bytes);
-        let folder = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
-        let scratch = ScratchFolder::new(&folder)?;
-        let inner: Box<dyn InputModel> = if let Some(layout) = Layout::read(&content, path)? {
-            let model = layout.restore(&content, path, scratch.path())?;
-            drop(content);
-            open_restored(&model, path, options)?
-        } else if holds_model_folder(&content) {
-            unpack(&content, path, scratch.path())?;
-            drop(content);
-            (four_d_gaussians::ENTRY.open)(scratch.path(), options)?
-        } else {
-            let file = scratch.path().join("cloud.ply");
-            unpack(&content, path, &file)?;
-            drop(content);
-            (ply_sequence::FILE.open)(&file, options)?
-        };
-        Ok(OpenArchive { inner, scratch, digest, size: parts.into() })
-    }
+/// Opens the archive at `path`: writes its files to a temporary folder and opens them there.
+fn open(path: &Path, options: &OpenOptions) -> Result<Opened> {
+    options.refuse_for(path)?;
+    let bytes = load(path, options.memory)?;
+    let (content, parts) = archive::decode(&bytes, path, options.memory)?;
+    let digest = format!("{:032x}", xxh3_128(&bytes));
+    drop(bytes);
+    let scratch = ScratchFolder::new(&options.scratch())?;
+    let opened = if let Some(layout) = Layout::read(&content, path)? {
+        let model = layout.restore(&content, path, scratch.path())?;
+        drop(content);
+        open_restored(&model, path, options)?
+    } else if holds_model_folder(&content) {
+        unpack(&content, path, scratch.path())?;
+        drop(content);
+        (four_d_gaussians::ENTRY.open)(scratch.path(), options)?
+    } else {
+        let file = scratch.path().join("cloud.ply");
+        unpack(&content, path, &file)?;
+        drop(content);
+        (ply_sequence::FILE.open)(&file, options)?
+    };
+    let original = Original::Archive { digest, size: parts.into() };
+    Ok(Opened::Model(Unpacked { _scratch: scratch, kind: "gsz archive", original }.into_model(opened.into_linked()?)))
 }
 
 /// Opens the model at `model`, whose files were restored from the archive at `path`.
-fn open_restored(model: &Path, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+fn open_restored(model: &Path, path: &Path, options: &OpenOptions) -> Result<Opened> {
     let found = FoundInput::new(model, options.memory)?;
     let format = FORMATS_WITH_LAYOUT.iter().find(|format| (format.recognizes)(&found));
     let unknown = || {
@@ -173,134 +153,4 @@ fn open_restored(model: &Path, path: &Path, options: &OpenOptions) -> Result<Box
             .hint("the archive is damaged; copy it again")
     };
     (format.ok_or_else(unknown)?.open)(model, options)
-}
-
-impl InputModel for OpenArchive {
-    fn kind(&self) -> &'static str {
-        "gsz archive"
-    }
-
-    fn source(&self) -> &dyn FrameSource {
-        self.inner.source()
-    }
-
-    fn digest(&self) -> Result<String> {
-        Ok(self.digest.clone())
-    }
-
-    fn bytes(&self) -> Result<u64> {
-        Ok(self.size.total())
-    }
-
-    fn size(&self) -> Result<ModelSize> {
-        Ok(self.size)
-    }
-
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
-        self.inner.size_written(kind, path)
-    }
-
-    fn stored_bytes(&self) -> Result<u64> {
-        self.inner.stored_bytes()
-    }
-
-    fn memory_profile(&self) -> MemoryProfile {
-        self.inner.memory_profile()
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        self.inner.timing()
-    }
-
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        let OpenArchive { inner, scratch, digest, size } = *self;
-        Ok(Box::new(OpenArchive { inner: inner.with_times(times)?, scratch, digest, size }))
-    }
-
-    fn time_convention(&self) -> TimeConvention {
-        self.inner.time_convention()
-    }
-
-    fn duration(&self) -> f64 {
-        self.inner.duration()
-    }
-
-    fn notes(&self) -> Vec<String> {
-        self.inner.notes()
-    }
-
-    fn data_frames(&self) -> Option<usize> {
-        self.inner.data_frames()
-    }
-
-    fn merge_class(&self, id: u32) -> u8 {
-        self.inner.merge_class(id)
-    }
-
-    fn data_folder(&self) -> Option<&str> {
-        self.inner.data_folder()
-    }
-
-    fn background(&self) -> Option<[f32; 3]> {
-        self.inner.background()
-    }
-
-    fn canonical(&self) -> Option<&Gaussians> {
-        self.inner.canonical()
-    }
-
-    fn columns(&self) -> Result<Vec<ColumnInfo>> {
-        self.inner.columns()
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        self.inner.default_output_kind()
-    }
-
-    fn keeps_motion(&self, kind: OutputKind) -> bool {
-        self.inner.keeps_motion(kind)
-    }
-
-    fn motion_note(&self, kind: OutputKind) -> Option<&'static str> {
-        self.inner.motion_note(kind)
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        self.inner.check_output(kind, path)
-    }
-
-    fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
-        self.inner.compute_proxies(clusters, reference, rule)
-    }
-
-    fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        self.inner.compressed_frames(compressed)
-    }
-
-    fn write(
-        &self,
-        compressed: &CompressedModel,
-        kind: OutputKind,
-        path: &Path,
-        limits: &Limits,
-        events: &Events,
-    ) -> Result<Vec<String>> {
-        self.inner.write(compressed, kind, path, limits, events)
-    }
-
-    fn can_round_field(&self) -> Result<bool> {
-        self.inner.can_round_field()
-    }
-
-    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
-        self.inner.reason_to_keep_sh_degree()
-    }
-
-    fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
-        self.inner.archive_content(compressed)
-    }
-
-    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
-        self.inner.decode_frames(content)
-    }
 }

@@ -26,7 +26,7 @@ use crate::files::ply::{Ply, PlyEncoding, Property, Scalar};
 use crate::files::splatv::{ROW_BYTES, Splatv};
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficient_count};
-use crate::models::four_d_gaussians::cfg_args;
+use crate::models::cfg_args;
 use crate::models::in_checkpoint::rows::{RowElement, RowTensors};
 
 /// Kind of content of a file of a model. It determines which bytes of the file an archive stores as values; all other

@@ -12,24 +12,22 @@ use crate::files::atomic::ScratchFolder;
 use crate::limits::Limits;
 use crate::model::SequenceInfo;
 use crate::models::input_model::{InputModel, OpenOptions};
+use crate::models::opened::OpenInput;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
-use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadCounts, ReadPlan};
+use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, ReadCounts, ReadPlan};
 
 /// Function and options with which an input model was opened. They serve to open it again after it has been stored in
 /// an archive (`.gsz`).
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Reopener {
-    open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
+    open: OpenInput,
     options: OpenOptions,
 }
 
 impl Reopener {
     /// Creates a reopener for a model that was opened with the function `open` and the options `options`.
-    pub(in crate::models) fn new(
-        open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
-        options: &OpenOptions,
-    ) -> Reopener {
+    pub(in crate::models) fn new(open: OpenInput, options: &OpenOptions) -> Reopener {
         // An archive holds one training iteration.
         let options = OpenOptions { iteration: None, events: Events::default(), ..options.clone() };
         Reopener { open, options }
@@ -67,7 +65,8 @@ impl Reopener {
         let archive = Path::new("archive");
         let layout = Layout::read(content, archive)?;
         let layout = layout.ok_or_else(|| Error::internal("an archive of another kind of model was given"))?;
-        let model = (self.open)(&layout.restore(content, archive, scratch.path())?, &self.options)?;
+        let opened = (self.open)(&layout.restore(content, archive, scratch.path())?, &self.options)?;
+        let model = opened.into_linked()?;
         let model = if model.source().info().times == times { model } else { model.with_times(times.to_vec())? };
         Ok(Box::new(RestoredFrames { model, _scratch: scratch }))
     }
@@ -102,9 +101,5 @@ impl FrameSource for RestoredFrames {
 
     fn reads(&self) -> ReadCounts {
         self.model.source().reads()
-    }
-
-    fn prefetcher(&self) -> Option<&dyn Prefetch> {
-        self.model.source().prefetcher()
     }
 }

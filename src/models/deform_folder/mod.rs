@@ -5,7 +5,6 @@
 //! merging Gaussians and writing are shared. The output is a folder of the same layout with a smaller point cloud file.
 //! The network is copied byte for byte, and so is the configuration, except for the SH degree if that is lowered.
 
-mod arguments;
 mod paths;
 mod proxies;
 #[cfg(test)]
@@ -14,16 +13,15 @@ mod tests;
 use std::fs;
 use std::path::Path;
 
-pub(super) use arguments::Arguments;
 use paths::Paths;
 pub(super) use paths::{has_network, needs_network, network_tensor_names};
 
 use super::archive::pack::FileContent;
 use super::archive::reopen::Reopener;
+use super::cfg_args::{Arguments, read_for_degree};
 use super::files::copy;
-use super::four_d_gaussians::cfg_args::read_for_degree;
-use super::size::{ModelSize, bytes_below, bytes_read_for};
-use super::trajectories::{check_output, state_bytes, write_sequence};
+use super::size::{ModelSize, bytes_below, file_bytes};
+use super::trajectories::write_sequence;
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::deform::Tensors;
@@ -32,10 +30,10 @@ use crate::files::cameras::TimeConvention;
 use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::ply::{Ply, PlyEncoding, read_plane};
 use crate::limits::Limits;
-use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, OpenOptions, TimeOrigin};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, propose_proxies};
-use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
@@ -82,10 +80,8 @@ pub(super) struct ModelParts<'a> {
 pub(super) struct DeformFolder<L> {
     paths: Paths,
     model: MotionModelFrames<L>,
-    source_path: Option<String>,
-    white_background: bool,
     tensor_bytes: u64,
-    notes: Vec<String>,
+    description: ModelDescription,
     reopener: Reopener,
 }
 
@@ -98,9 +94,9 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
     pub(super) fn open(
         root: &Path,
         options: &OpenOptions,
-        format: &ModelFormat,
+        format: &InputFormat,
         make: impl FnOnce(&ModelParts<'_>) -> Result<(L, Vec<String>)>,
-    ) -> Result<Box<dyn InputModel>> {
+    ) -> Result<Opened> {
         let paths = Paths::locate(root, options.iteration)?;
         let arguments = Arguments::read(&paths.cfg_args)?;
         let (tensors, prefix_note) = paths.tensors(options.memory)?;
@@ -112,18 +108,20 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         notes.extend(prefix_note);
         notes.extend(ply.notes_with(&raw.gaussians));
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
-        let source_path = arguments.get("source_path").string()?;
-        let white_background = arguments.get("white_background").bool(false)?;
-        let model = MotionModelFrames::new(motion_model, raw, ply.sh_degree());
-        Ok(Box::new(DeformFolder {
-            paths,
-            model,
-            source_path,
-            white_background,
-            tensor_bytes: 4 * values as u64,
+        let description = ModelDescription {
+            kind: L::KIND,
             notes,
-            reopener: Reopener::new(format.open, options),
-        }))
+            timing: TimeOrigin::Continuous,
+            // Camera times are used unchanged, because the network was trained with them.
+            time_convention: TimeConvention::Given,
+            data_folder: arguments.get("source_path").string()?,
+            background: arguments.get("white_background").bool(false)?.then_some([1.0; 3]),
+            default_output_kind: OutputKind::Model,
+            ..ModelDescription::default()
+        };
+        let model = MotionModelFrames::new(motion_model, raw, ply.sh_degree());
+        let (tensor_bytes, reopener) = (4 * values as u64, Reopener::new(format.open, options));
+        Ok(Opened::from_model(DeformFolder { paths, model, tensor_bytes, description, reopener }))
     }
 
     /// Returns the text of the input's `cfg_args` file, in which an SH degree higher than `sh_degree` is replaced by
@@ -199,13 +197,13 @@ fn raw(ply: &Ply) -> Result<StoredParams> {
 
 /// Returns the size in bytes of the files that a renderer opens: the point cloud file, the network and `cfg_args`.
 fn size_of(paths: &Paths) -> Result<ModelSize> {
-    let (cloud, field) = (bytes_read_for([&*paths.point_cloud])?, bytes_read_for([&*paths.network])?);
-    Ok(ModelSize { cloud, field, rest: bytes_read_for([&*paths.cfg_args])?, ..ModelSize::default() })
+    let size = ModelSize::from_cloud_file(&paths.point_cloud, [&paths.cfg_args])?;
+    Ok(ModelSize { field: file_bytes([&paths.network])?, ..size })
 }
 
 impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
-    fn kind(&self) -> &'static str {
-        L::KIND
+    fn description(&self) -> ModelDescription {
+        self.description.clone()
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -214,10 +212,6 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
 
     fn digest(&self) -> Result<String> {
         self.paths.digest()
-    }
-
-    fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.total())
     }
 
     fn size(&self) -> Result<ModelSize> {
@@ -233,33 +227,19 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
 
     fn memory_profile(&self) -> MemoryProfile {
         let motion_model = self.model.motion_model();
-        let features = 4 * self.model.raw().format_specific.width() as u64;
-        let whole = state_bytes(self.model.info().sh_degree, Attributes::all()) + features;
+        let profile = self.model.memory_profile(motion_model.seconds_per_state());
+        let whole = profile.per_gaussian;
         MemoryProfile {
-            per_gaussian: whole,
             // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
             opening: whole + 24,
             // A copy of the stored parameters, the values prepared from them, and the network's outputs for a block of
             // Gaussians.
             reader: 2 * whole + motion_model.bytes_per_gaussian() as u64 + 128,
-            compressed: 2 * whole,
-            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
-            file: whole + 24,
+            jacobian: profile.jacobian + 36,
             // Two copies of the network's tensors: as read from the file, and as used.
             fixed: 2 * self.tensor_bytes + motion_model.bytes() as u64,
-            gaussian_block: GAUSSIAN_BLOCK as u64,
-            seconds_per_state: motion_model.seconds_per_state(),
-            ..MemoryProfile::default()
+            ..profile
         }
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Continuous
-    }
-
-    /// Returns [`TimeConvention::Given`]: camera times are used unchanged, because the network was trained with them.
-    fn time_convention(&self) -> TimeConvention {
-        TimeConvention::Given
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -267,31 +247,8 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         Ok(self)
     }
 
-    fn notes(&self) -> Vec<String> {
-        self.notes.clone()
-    }
-
-    fn data_folder(&self) -> Option<&str> {
-        self.source_path.as_deref()
-    }
-
-    fn background(&self) -> Option<[f32; 3]> {
-        self.white_background.then_some([1.0; 3])
-    }
-
     fn canonical(&self) -> Option<&Gaussians> {
         Some(&self.model.raw().gaussians)
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        OutputKind::Model
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        match kind {
-            OutputKind::Model | OutputKind::Archive => Ok(()),
-            _ => check_output(self.model.info().times.len(), kind, path),
-        }
     }
 
     fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
@@ -301,7 +258,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     }
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, compressed, (self.default_output_kind(), "model"), FileContent::from_name)
+        self.reopener.content(self, compressed, (OutputKind::Model, "model"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::files::digest::digest_of_files;
 use crate::files::state_dict::{is_pair, names, read_state_dict_with_note};
 use crate::limits::ReadLimit;
-use crate::models::four_d_gaussians::cfg_args::read;
+use crate::models::cfg_args::read;
 use crate::models::iterations::iteration_numbers;
 
 /// Name of the subfolder that holds the point cloud files.

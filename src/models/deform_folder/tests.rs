@@ -204,8 +204,8 @@ fn states_of_deformable_3d_gaussians_follow_the_formulas() {
     for kind in &ALL_VARIANTS[..2] {
         let made = TestModel::deformable(*kind);
         let model = made.open();
-        assert_eq!(model.kind(), "Deformable-3D-Gaussians model");
-        assert_eq!((model.background(), model.notes()), (Some([1.0; 3]), vec![]));
+        assert_eq!(model.description().kind, "Deformable-3D-Gaussians model");
+        assert_eq!((model.description().background, model.description().notes), (Some([1.0; 3]), vec![]));
         let places: Vec<[f64; 3]> = (0..COUNT).map(|i| ["x", "y", "z"].map(|name| made.row::<1>(name, i)[0])).collect();
         for (state, time) in states(model.source()).iter().zip(TIMES) {
             let by = motion(&made.tensors, "", &places, time);
@@ -232,7 +232,7 @@ fn states_of_sc_gs_follow_the_formulas() {
     for kind in [ALL_VARIANTS[0], ALL_VARIANTS[2]] {
         let made = TestModel::sc_gs(kind);
         let model = made.open();
-        assert_eq!((model.kind(), model.notes()), ("SC-GS model", vec![]));
+        assert_eq!((model.description().kind, model.description().notes), ("SC-GS model", vec![]));
         let [nodes, radius, weight] = ["nodes", "_node_radius", "_node_weight"].map(|name| &made.tensors[name].data);
         let places: Vec<[f64; 3]> = nodes.chunks(5).map(|node| [0, 1, 2].map(|c| f64::from(node[c]))).collect();
         for (state, time) in states(model.source()).iter().zip(TIMES) {
@@ -286,7 +286,7 @@ fn sc_gs_without_nodes_uses_the_network_directly() {
         ..TestModel::deformable(DeepVariant { screws: false, ..ALL_VARIANTS[0] })
     };
     let model = made.open();
-    assert_eq!(model.kind(), "SC-GS model");
+    assert_eq!(model.description().kind, "SC-GS model");
     let places: Vec<[f64; 3]> = (0..COUNT).map(|i| ["x", "y", "z"].map(|name| made.row::<1>(name, i)[0])).collect();
     let (state, by) = (&states(model.source())[2], motion(&made.tensors, "", &places, 0.5));
     for i in 0..COUNT {
@@ -348,7 +348,7 @@ fn jacobian_agrees_with_finite_differences() {
         // Within a step a ReLU may switch or another node may become nearest. This happens often, since the network is
         // random and some of its sines repeat 512 times. A wrong formula would be wrong nearly everywhere; the
         // network's own test is exact.
-        assert!(6 * wrong < all, "{}: {wrong} of {all} derivatives are wrong", model.kind());
+        assert!(6 * wrong < all, "{}: {wrong} of {all} derivatives are wrong", model.description().kind);
     }
 }
 
@@ -427,7 +427,7 @@ fn written_proxies_and_deltas_read_back() {
                 states(again.source()),
                 states(&*model.compressed_frames(&compressed).unwrap()),
                 "{}",
-                model.kind()
+                model.description().kind
             );
             let text = fs::read_to_string(path.join("cfg_args")).unwrap();
             assert!(text.contains(&format!("sh_degree={sh_degree}")), "{text}");
@@ -456,7 +456,7 @@ fn proxy_of_equal_members_equals_them() {
             assert!((0..3).all(|c| (state.position.plane(c)[0] - all[frame].position.plane(c)[0]).abs() < 1e-6));
             // Scales and rotations of proxies are right on average only; random quaternions have any length.
             let found = relative_difference(state_covariance(state, 0), state_covariance(&all[frame], 0));
-            assert!(found < 0.5, "{} at {frame}: covariance off by {found}", model.kind());
+            assert!(found < 0.5, "{} at {frame}: covariance off by {found}", model.description().kind);
         }
     }
 }
@@ -482,7 +482,7 @@ fn iterations_need_both_folders() {
 fn weights_take_precedence_over_cfg_args() {
     let mut made = TestModel::deformable(ALL_VARIANTS[1]);
     made.cfg_args = "Namespace(is_6dof=False, is_blender=False)".into();
-    let notes = made.open().notes();
+    let notes = made.open().description().notes;
     assert!(
         notes.len() == 1 && notes[0].contains("is_6dof = False") && notes[0].contains("the weights are used"),
         "{notes:?}"

@@ -15,12 +15,12 @@ use super::deform_folder::{DeformFolder, ModelParts, NetworkMotionModel, has_net
 use crate::deform::{EncodedPositions, Network, PredictedMotion};
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
-use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
+use crate::models::opened::InputFormat;
 
 /// Model format of Deformable-3D-Gaussians: recognizes and opens a model folder. Also recognizes a folder without the
 /// network, of this trainer or of SC-GS, so that opening it names the missing folder.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| found.is_folder && (has_network(found.path) || needs_network(found.path)),
     open: |path, options| DeformFolder::open(path, options, &ENTRY, DeformableMotion::new),
 };

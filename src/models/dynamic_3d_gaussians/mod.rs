@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 
 use super::archive::pack::FileContent;
 use super::archive::reopen::Reopener;
-use super::size::bytes_read_for;
-use super::trajectories::{check_output, state_bytes, write_sequence};
+use super::size::{ModelSize, file_bytes};
+use super::trajectories::{state_bytes, write_sequence};
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::Result;
@@ -19,7 +19,8 @@ use crate::files::digest::digest_of_files;
 use crate::files::npz::write::write_like;
 use crate::limits::Limits;
 use crate::model::{Attributes, Gaussians, SH_C0, color_from_sh};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, TimeOrigin};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription};
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -32,7 +33,7 @@ use proxies::MergedSource;
 const FILE: &str = "params.npz";
 
 /// Model format of Dynamic3DGaussians: recognizes and opens a file `params.npz`, or the folder that contains it.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
         match found.is_folder {
@@ -43,14 +44,19 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| {
         options.refuse_for(path)?;
         let file = if path.is_dir() { path.join(FILE) } else { path.to_owned() };
-        let scratch = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
-        Ok(Box::new(Params::open(&file, &scratch, Reopener::new(ENTRY.open, options))?))
+        Ok(Opened::from_model(Params::open(&file, &options.scratch(), Reopener::new(ENTRY.open, options))?))
     },
 };
 
 impl InputModel for Params {
-    fn kind(&self) -> &'static str {
-        "Dynamic3DGaussians model"
+    fn description(&self) -> ModelDescription {
+        ModelDescription {
+            kind: "Dynamic3DGaussians model",
+            // The authors' training uses a black background.
+            background: Some([0.0; 3]),
+            default_output_kind: OutputKind::Model,
+            ..ModelDescription::default()
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -61,8 +67,8 @@ impl InputModel for Params {
         digest_of_files([&*self.path()])
     }
 
-    fn bytes(&self) -> Result<u64> {
-        bytes_read_for([&*self.path()])
+    fn size(&self) -> Result<ModelSize> {
+        Ok(ModelSize::from_frames(file_bytes([self.path()])?))
     }
 
     fn memory_profile(&self) -> MemoryProfile {
@@ -76,32 +82,12 @@ impl InputModel for Params {
         }
     }
 
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Numbered
-    }
-
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(Params::with_times(*self, times)?))
     }
 
-    /// Returns black as the background color, which the authors' training uses.
-    fn background(&self) -> Option<[f32; 3]> {
-        Some([0.0; 3])
-    }
-
     fn merge_class(&self, id: u32) -> u8 {
         u8::from(self.is_foreground(id as usize).unwrap_or(false))
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        OutputKind::Model
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        match kind {
-            OutputKind::Model | OutputKind::Archive => Ok(()),
-            _ => check_output(self.info().times.len(), kind, path),
-        }
     }
 
     fn compute_proxies(&self, clusters: &[Cluster], _: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
@@ -109,8 +95,7 @@ impl InputModel for Params {
     }
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener()
-            .content(self, compressed, (self.default_output_kind(), "model"), |_| FileContent::Npz(Params::archived))
+        self.reopener().content(self, compressed, (OutputKind::Model, "model"), |_| FileContent::Npz(Params::archived))
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

@@ -64,7 +64,7 @@ fn states_are_the_array_values_compressed_or_not() {
     write(&stored, &arrays(), CompressionMethod::Stored);
     write(&small, &arrays(), CompressionMethod::Deflated);
     let model = open(folder.path()).unwrap();
-    assert_eq!((model.kind(), model.source().info().count), ("Dynamic3DGaussians model", 5));
+    assert_eq!((model.description().kind, model.source().info().count), ("Dynamic3DGaussians model", 5));
     assert_eq!(model.source().info().times, [0.0, 0.5, 1.0]);
     let (found, arrays) = (states(&*model), arrays());
     for (frame, state) in found.iter().enumerate() {

@@ -4,7 +4,7 @@
 //! byte, except for the SH degree if that is lowered. The field is copied too, or written in half precision with the
 //! same tensor names and shapes.
 
-pub(super) mod cfg_args;
+mod config;
 mod model_folder;
 mod proxies;
 mod small_field;
@@ -13,8 +13,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
+use super::cfg_args;
 use super::files::copy;
-use super::size::{ModelSize, bytes_below, bytes_read_for};
+use super::size::{ModelSize, NO_FILES, bytes_below, file_bytes};
 use super::trajectories::{state_bytes, write_sequence};
 use crate::archive::{ArchiveContent, TensorRole};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
@@ -25,8 +26,9 @@ use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::state_dict::{StoredTensor, TensorValues, is_floating, read_state_dict, write_state_dict};
 use crate::limits::Limits;
 use crate::model::{Attributes, Gaussians, Jacobian};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, TimeOrigin};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, TimeOrigin};
 use crate::models::motion_model::compressed_raw;
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -35,14 +37,25 @@ use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
 
 /// Model format of 4DGaussians: recognizes and opens a model folder.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| found.is_folder && found.path.join("point_cloud").is_dir(),
-    open: |path, options| Ok(Box::new(ModelFolder::open_with(path, options.iteration, &options.ply())?)),
+    open: |path, options| Ok(Opened::from_model(ModelFolder::open_with(path, options.iteration, &options.ply())?)),
 };
 
 impl InputModel for ModelFolder {
-    fn kind(&self) -> &'static str {
-        "4DGaussians model"
+    fn description(&self) -> ModelDescription {
+        let deforms_colors = self.field().deformed_attributes().contains(Attributes::SH);
+        ModelDescription {
+            kind: "4DGaussians model",
+            notes: self.notes().to_vec(),
+            timing: TimeOrigin::Continuous,
+            data_folder: self.config().source_path.clone(),
+            background: self.config().white_background.then_some([1.0; 3]),
+            default_output_kind: OutputKind::Model,
+            reason_to_keep_sh_degree: deforms_colors
+                .then_some("the SH head of the deformation field adds to coefficients of every degree"),
+            ..ModelDescription::default()
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -51,10 +64,6 @@ impl InputModel for ModelFolder {
 
     fn digest(&self) -> Result<String> {
         self.paths().digest()
-    }
-
-    fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.total())
     }
 
     /// Returns the size in bytes of the files that a renderer opens: the point cloud file, the deformation field and
@@ -71,7 +80,7 @@ impl InputModel for ModelFolder {
                 let folder = iteration_folder(path, self.paths().iteration);
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
-            OutputKind::Ply => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
+            OutputKind::Ply => ModelSize::from_cloud_file(path, NO_FILES),
             // All other outputs are written from the states at the frames. The caller measures an archive itself.
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
@@ -99,32 +108,12 @@ impl InputModel for ModelFolder {
         }
     }
 
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Continuous
-    }
-
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(ModelFolder::with_times(*self, times)?))
     }
 
-    fn notes(&self) -> Vec<String> {
-        ModelFolder::notes(self).to_vec()
-    }
-
-    fn data_folder(&self) -> Option<&str> {
-        self.config().source_path.as_deref()
-    }
-
-    fn background(&self) -> Option<[f32; 3]> {
-        self.config().white_background.then_some([1.0; 3])
-    }
-
     fn canonical(&self) -> Option<&Gaussians> {
         Some(ModelFolder::canonical(self))
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        OutputKind::Model
     }
 
     fn motion_note(&self, kind: OutputKind) -> Option<&'static str> {
@@ -196,13 +185,6 @@ impl InputModel for ModelFolder {
         is_floating(&self.paths().deformation, self.memory())
     }
 
-    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
-        self.field().deformed_attributes().contains(Attributes::SH).then_some(
-            "the SH head of the deformation field adds to \
-                                                               coefficients of every degree",
-        )
-    }
-
     fn write(
         &self,
         compressed: &CompressedModel,
@@ -222,7 +204,7 @@ impl InputModel for ModelFolder {
                 self.write_field(compressed.field, &folder.join("deformation.pth"))?;
                 self.write_cloud(compressed, &folder.join("point_cloud.ply"))?;
                 let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
-                let bytes = bytes_read_for(training.map(PathBuf::as_path))?;
+                let bytes = file_bytes(training)?;
                 if bytes > 0 {
                     notes.push(format!(
                         "deformation_table.pth and deformation_accum.pth ({bytes} bytes, read by training only) were \
@@ -232,10 +214,7 @@ impl InputModel for ModelFolder {
             }
             OutputKind::Ply if self.motion_note(kind).is_some() => self.write_cloud(compressed, path)?,
             OutputKind::Archive => {
-                return Err(Error::internal(
-                    "an archive is written from its content, not by the \
-                                                               model",
-                ));
+                return Err(Error::internal("an archive is written from its content, not by the model"));
             }
             _ => notes.extend(write_sequence(
                 &*self.compressed_frames(compressed)?,
@@ -293,8 +272,7 @@ pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
 /// Returns the size in bytes of a model, divided into its three files: the point cloud, the deformation field and the
 /// configuration.
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<ModelSize> {
-    let (cloud, field, rest) = (bytes_read_for([cloud])?, bytes_read_for([field])?, bytes_read_for([configuration])?);
-    Ok(ModelSize { cloud, field, rest, ..ModelSize::default() })
+    Ok(ModelSize { field: file_bytes([field])?, ..ModelSize::from_cloud_file(cloud, [configuration])? })
 }
 
 /// Returns the role of the tensor called `name` in the deformation field, by which an archive chooses how to store it:

@@ -7,8 +7,6 @@
 //!
 //! `.ftgs.ply` and `.tsog` files use the same motion, but with other bounds and another unit of time.
 
-use xxhash_rust::xxh3::Xxh3;
-
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::ftgs::{ClipTimes, LOG_TIME_DEVIATION, TIME_CENTER, VELOCITY};
@@ -190,8 +188,6 @@ impl ProxyRule for FreeTime {
         }
         Ok(proxies)
     }
-
-    fn hash_settings(&self, _: &mut Xxh3) {}
 
     fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
         let params = self.with_deviations(raw);

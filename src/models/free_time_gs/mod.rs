@@ -8,12 +8,11 @@
 
 pub(super) mod frame_state;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use super::archive::reopen::Reopener;
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{
-    CheckpointModel, CheckpointReader, ModelDescription, RowElement, numbered_files, row_count,
+    CheckpointFile, CheckpointModel, CheckpointReader, NumberedFiles, RowElement, numbered_files, row_count,
 };
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId, Pickle};
@@ -21,68 +20,43 @@ use crate::files::ftgs::{LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, V
 use crate::files::state_dict::wrapper_note;
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficient_count};
-use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
+use crate::models::input_model::{ModelDescription, OpenOptions};
+use crate::models::opened::{InputFormat, Opened};
 use frame_state::FreeTime;
 
 /// Name of the subfolder of a result folder that holds the checkpoints.
 const CHECKPOINT_FOLDER: &str = "ckpts";
 
 /// Model format of gsplat checkpoints: recognizes and opens a checkpoint, or the result folder of a training.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| match found.is_folder {
         true => !checkpoints(found.path).is_empty(),
         false => found.is_checkpoint() && splats_in(found.path, found.memory),
     },
-    open: |path, options| {
-        let (root, file, notes) = match path.is_dir() {
-            true => {
-                let (file, notes) = choose(path, options)?;
-                (Some(path.to_owned()), file, notes)
-            }
-            false => {
-                options.refuse_for(path)?;
-                (None, path.to_owned(), Vec::new())
-            }
-        };
-        open(ModelDescription { root, file, notes, ..ModelDescription::default() }, options)
-    },
+    open,
 };
 
 /// Returns the checkpoints, each with its training iteration, of a result folder or of a folder of checkpoints, in
-/// increasing order of iteration.
-fn checkpoints(path: &Path) -> Vec<(u32, PathBuf)> {
+/// decreasing order of iteration.
+fn checkpoints(path: &Path) -> NumberedFiles {
     let in_folder = |folder: &Path| {
         let (mut one, first) = (numbered_files(folder, "ckpt_", ".pt"), numbered_files(folder, "ckpt_", "_rank0.pt"));
         one.extend(first);
-        one.sort();
+        one.sort_unstable_by(|a, b| b.cmp(a));
         one
     };
     let inner = in_folder(&path.join(CHECKPOINT_FOLDER));
     if inner.is_empty() { in_folder(path) } else { inner }
 }
 
-/// Returns the path of the checkpoint of the requested iteration. Without a request, returns the last one and a note
-/// for the user.
-///
-/// # Errors
-/// Fails if there is no such checkpoint, or if the model is divided among several processes (ranks) of the training.
-fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
-    let found = checkpoints(path);
-    let names = || found.iter().map(|(k, _)| k.to_string()).collect::<Vec<_>>().join(", ");
-    let chosen = match options.iteration {
-        Some(k) => found.iter().find(|(number, _)| *number == k),
-        None => found.last(),
-    };
-    let expected = || options.iteration.map_or("a checkpoint".to_owned(), |k| format!("a checkpoint ckpt_{k}.pt"));
-    let (_, file) = chosen.ok_or_else(|| Error::input(path, CHECKPOINT_FOLDER, expected(), names()))?;
+/// Fails if the checkpoint `file` holds only the part of the model of one process (rank) of the training.
+fn refuse_part_of_model(file: &Path) -> Result<()> {
     let second_rank = file.to_string_lossy().replace("_rank0.pt", "_rank1.pt");
     if second_rank != file.to_string_lossy() && Path::new(&second_rank).exists() {
         return Err(Error::input(file, "", "a model in one file", "one of several ranks")
             .hint("join their tensors along the first axis with torch.cat, and save the checkpoint again"));
     }
-    let name = file.file_name().unwrap_or_default().to_string_lossy();
-    let note = format!("{} checkpoints found: {name} is read (choose another with --iteration)", found.len());
-    Ok((file.clone(), if found.len() > 1 && options.iteration.is_none() { vec![note] } else { Vec::new() }))
+    Ok(())
 }
 
 /// Returns whether the checkpoint at `path` holds Gaussians in tensors with the names that gsplat uses.
@@ -99,10 +73,12 @@ fn splat_tensor(pickle: &Pickle, splats: NodeId, name: &str) -> Option<NodeId> {
 }
 
 /// Opens a checkpoint as FreeTimeGS if it has velocities, else as a static model.
-fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
-    let reopener = Some(Reopener::new(ENTRY.open, options));
-    let mut description = ModelDescription { reopener, ..description };
-    let checkpoint = Checkpoint::open(&description.file, options.memory)?;
+fn open(path: &Path, options: &OpenOptions) -> Result<Opened> {
+    let file = CheckpointFile::find(path, options, checkpoints, "ckpt_<K>.pt", open)?;
+    if file.root.is_some() {
+        refuse_part_of_model(&file.file)?;
+    }
+    let checkpoint = Checkpoint::open(&file.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let Some(splats) = pickle.item(pickle.root(), "splats") else {
         let found = checkpoint.describe(pickle.root());
@@ -123,8 +99,9 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     let names = ["means", "scales", "quats", "opacities", "sh0", "shN"];
     let nodes = names.iter().map(|name| find(name)).collect::<Result<Vec<NodeId>>>()?;
     let has_motion = splat_tensor(pickle, splats, "velocities").is_some();
+    let mut notes = Vec::from_iter(file.note.clone());
     if pickle.item(splats, "means").is_none() {
-        description.notes.push(wrapper_note("module."));
+        notes.push(wrapper_note("module."));
     }
     let motion_nodes = if has_motion {
         ["times", "durations", "velocities"].iter().map(|name| find(name)).collect::<Result<_>>()?
@@ -172,16 +149,11 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         reader.read(id, &place(name), row, RowElement::format_specific(first, width))?;
     }
     training_nodes.into_iter().for_each(|id| reader.add_training_tensor(id));
+    let kind = if has_motion { "FreeTimeGS checkpoint" } else { "gsplat checkpoint" };
+    let description = ModelDescription { kind, notes, ..ModelDescription::default() };
     Ok(match has_motion {
-        true => {
-            let description =
-                ModelDescription { kind: "FreeTimeGS checkpoint", seconds_per_state: 3e-8, ..description };
-            Box::new(CheckpointModel::new(reader, FreeTime::TRAINED, description)?)
-        }
-        false => {
-            let description = ModelDescription { kind: "gsplat checkpoint", seconds_per_state: 1e-8, ..description };
-            Box::new(CheckpointModel::new(reader, Still, description)?)
-        }
+        true => Opened::from_model(CheckpointModel::new(reader, FreeTime::TRAINED, file, 3e-8, description)?),
+        false => Opened::from_model(CheckpointModel::new(reader, Still, file, 1e-8, description)?),
     })
 }
 

@@ -1,4 +1,5 @@
 use std::fs;
+use std::path::PathBuf;
 
 use super::*;
 use crate::compressed_model::{Cluster, CompressedModel, ReferenceFrame};
@@ -8,6 +9,7 @@ use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
 use crate::models;
 use crate::models::archive::checks::check_round_trip;
+use crate::models::input_model::InputModel;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::progress::Events;
@@ -109,7 +111,7 @@ fn states_follow_the_formulas() {
     let splats = splats();
     let folder = ResultFolder::put(&splats);
     let model = open(&folder.path("result")).unwrap();
-    assert_eq!(model.kind(), "FreeTimeGS checkpoint");
+    assert_eq!(model.description().kind, "FreeTimeGS checkpoint");
     let values = |k: usize, row: usize| -> Vec<f64> {
         let width = splats[k].2.len() / COUNT;
         splats[k].2[row * width..][..width].iter().map(|&x| f64::from(x)).collect()
@@ -192,7 +194,7 @@ fn model_without_velocities_is_static_with_any_sh_degree() {
     made[5].2.truncate(9 * COUNT);
     let folder = ResultFolder::put(&made);
     let model = models::open(&folder.path("result"), &OpenOptions::default()).unwrap().into_linked().unwrap();
-    assert_eq!((model.kind(), model.source().info().sh_degree), ("gsplat checkpoint", 1));
+    assert_eq!((model.description().kind, model.source().info().sh_degree), ("gsplat checkpoint", 1));
     let whole = gather_all(model.source(), 0, Attributes::all()).unwrap();
     let result = folder.written(&*model, &CompressedModel::pruned(vec![1, 2], &rule()));
     let left = models::open(&result, &OpenOptions::default()).unwrap().into_linked().unwrap();
@@ -215,7 +217,7 @@ fn checkpoints_without_optimizers_are_read_and_written() {
     let expected = states(&*open(&folder.path("result")).unwrap());
     fs::write(folder.path("result/ckpts/ckpt_59999.pt"), bare_file(&splats(), "")).unwrap();
     let model = open(&folder.path("result")).unwrap();
-    assert_eq!((states(&*model), model.notes()), (expected.clone(), vec![]));
+    assert_eq!((states(&*model), model.description().notes), (expected.clone(), vec![]));
     let left = open(&folder.written(&*model, &CompressedModel::pruned(vec![1, 4], &rule()))).unwrap();
     assert_eq!(states(&*left), expected.iter().map(|state| state.pick(&[1, 4])).collect::<Vec<_>>());
 }
@@ -228,7 +230,11 @@ fn names_with_the_prefix_module_are_read_and_noted() {
     for name in ["result", "result/ckpts/ckpt_59999.pt"] {
         let model = open(&folder.path(name)).unwrap();
         assert_eq!(states(&*model), expected);
-        assert!(model.notes().iter().any(|note| note.contains("\"module.\"")), "{:?}", model.notes());
+        assert!(
+            model.description().notes.iter().any(|note| note.contains("\"module.\"")),
+            "{:?}",
+            model.description().notes
+        );
     }
 }
 
@@ -243,7 +249,7 @@ fn defective_rows_of_a_checkpoint_are_read_and_noted() {
     assert!(found[1].position.plane(1)[1].is_nan());
     assert!(found.iter().all(|state| state.opacity_logit.planes().iter().all(|logit| logit.is_finite())));
     let note = "2 of 5 rows repaired: infinite opacity logit";
-    assert!(model.notes().iter().any(|found| found.contains(note)), "{:?}", model.notes());
+    assert!(model.description().notes.iter().any(|found| found.contains(note)), "{:?}", model.description().notes);
 }
 
 #[test]

@@ -15,20 +15,21 @@ use xxhash_rust::xxh3::Xxh3;
 use super::archive::pack::FileContent;
 use super::archive::reopen::Reopener;
 use super::files::copy;
-use super::size::{ModelSize, bytes_below, bytes_read_for};
-use super::trajectories::{check_output, state_bytes, write_sequence};
+use super::size::{ModelSize, bytes_below};
+use super::trajectories::write_sequence;
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
 use crate::files::digest::hash_file;
+use crate::files::names::shown_name;
 use crate::files::tsog::TimedGaussians;
 use crate::limits::Limits;
-use crate::model::{Attributes, Jacobian, StoredParams};
-use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
+use crate::model::StoredParams;
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, OpenOptions, TimeOrigin};
 use crate::models::motion_model;
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
-use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::models::opened::OpenInput;
 use crate::outputs::kind::OutputKind;
 use crate::outputs::time_windows::{can_store, is_windowed, write_timed};
 use crate::progress::Events;
@@ -50,8 +51,11 @@ pub(super) trait ProxyRule: MotionModel {
     where
         Self: Sized;
 
-    /// Adds to `hash` the settings that determine the states of Gaussians but are not stored in the checkpoint.
-    fn hash_settings(&self, hash: &mut Xxh3);
+    /// Adds to `hash` the settings that determine the states of Gaussians but are not stored in the checkpoint; by
+    /// default none.
+    fn hash_settings(&self, hash: &mut Xxh3) {
+        let _ = hash;
+    }
 
     /// Returns the motion model to use for frames at `times`; `None` if this motion model serves for all times.
     fn for_times(&self, times: &[f64]) -> Option<Self>
@@ -73,33 +77,56 @@ pub(super) trait ProxyRule: MotionModel {
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
-
-    /// Returns the duration of the model in its own time unit.
-    fn duration(&self) -> f64 {
-        1.0
-    }
 }
 
-/// Properties of a model besides its Gaussians.
-#[derive(Debug, Default)]
-pub(super) struct ModelDescription {
-    /// Name of the model format, shown to users.
-    pub(super) kind: &'static str,
+/// Paths of files, each with the number in its name if it has one.
+pub(super) type NumberedFiles = Vec<(Option<u32>, PathBuf)>;
+
+/// Checkpoint that was found in a model folder or given by the user.
+#[derive(Debug)]
+pub(super) struct CheckpointFile {
     /// Path of the model folder if the user gave one; `None` if the user gave the checkpoint.
     pub(super) root: Option<PathBuf>,
     /// Path of the checkpoint file.
     pub(super) file: PathBuf,
-    /// Function and options with which the model was opened, to open it again from an archive; `None` if there are
-    /// none.
-    pub(super) reopener: Option<Reopener>,
-    /// Notes for the user.
-    pub(super) notes: Vec<String>,
-    /// Path of the folder with the training data.
-    pub(super) data_folder: Option<String>,
-    /// Whether the background of the training images is white.
-    pub(super) white_background: bool,
-    /// CPU seconds on one core to compute the state of one Gaussian at one frame (`benches/families.rs`).
-    pub(super) seconds_per_state: f64,
+    /// Function and options with which the model was opened, to open it again from an archive.
+    reopener: Reopener,
+    /// Note for the user if the folder has several checkpoints.
+    pub(super) note: Option<String>,
+}
+
+impl CheckpointFile {
+    /// Finds the checkpoint at `path`, a file or a model folder. `list` returns the checkpoints in a folder, the
+    /// preferred one first, each with its training iteration if its name gives one. Chooses the iteration that `options`
+    /// request, or else the first in the list. `name` is the name of such a file, with `<K>` in place of the iteration;
+    /// `open` is the function that opens the model.
+    ///
+    /// # Errors
+    /// Fails if there is no such checkpoint.
+    pub(super) fn find(
+        path: &Path,
+        options: &OpenOptions,
+        list: fn(&Path) -> NumberedFiles,
+        name: &str,
+        open: OpenInput,
+    ) -> Result<CheckpointFile> {
+        let reopener = Reopener::new(open, options);
+        if !path.is_dir() {
+            options.refuse_for(path)?;
+            return Ok(CheckpointFile { root: None, file: path.to_owned(), reopener, note: None });
+        }
+        let found = list(path);
+        let names = found.iter().map(|(_, file)| shown_name(file)).collect::<Vec<_>>().join(", ");
+        let requested = options.iteration;
+        let Some((_, file)) = found.iter().find(|(number, _)| requested.is_none() || *number == requested) else {
+            let expected = requested.map_or(name.to_owned(), |k| name.replace("<K>", &k.to_string()));
+            let available = if names.is_empty() { "none".to_owned() } else { names };
+            return Err(Error::input(path, "", format!("a file {expected}"), available));
+        };
+        let note = (found.len() > 1 && requested.is_none())
+            .then(|| format!("found {names}: {} is read (choose another with --iteration)", shown_name(file)));
+        Ok(CheckpointFile { root: Some(path.to_owned()), file: file.clone(), reopener, note })
+    }
 }
 
 /// Opened model whose Gaussians are rows of the tensors of a checkpoint.
@@ -107,45 +134,53 @@ pub(super) struct ModelDescription {
 pub(super) struct CheckpointModel<L: MotionModel> {
     tensors: RowTensors,
     model: MotionModelFrames<L>,
+    checkpoint: CheckpointFile,
     description: ModelDescription,
+    /// CPU seconds on one core to compute the state of one Gaussian at one frame (`benches/families.rs`).
+    seconds_per_state: f64,
 }
 
 impl<L: ProxyRule> CheckpointModel<L> {
     /// Creates a model from the parameters that `reader` has read. `motion_model` computes the states of the Gaussians
-    /// at each frame. A model that does not vary with time gets one frame at time 0.
+    /// at each frame, in `seconds_per_state` CPU seconds per state on one core. A model that does not vary with time gets
+    /// one frame at time 0. `description` has the properties of the model that do not follow from the other arguments.
     pub(super) fn new(
         reader: CheckpointReader,
         motion_model: L,
-        mut description: ModelDescription,
+        checkpoint: CheckpointFile,
+        seconds_per_state: f64,
+        description: ModelDescription,
     ) -> Result<CheckpointModel<L>> {
-        description.notes.extend(reader.note());
+        let is_still = motion_model.varying().is_empty();
+        let description = ModelDescription {
+            notes: description.notes.into_iter().chain(reader.note()).collect(),
+            timing: if is_still { TimeOrigin::Numbered } else { TimeOrigin::Continuous },
+            time_convention: TimeConvention::Given,
+            default_output_kind: OutputKind::Model,
+            reason_to_keep_sh_degree: Some("loaders of the checkpoint expect coefficients of every degree"),
+            ..description
+        };
         let sh_degree = reader.raw.gaussians.sh_degree();
         let model = MotionModelFrames::new(motion_model, reader.raw, sh_degree);
-        let is_still = model.motion_model().varying().is_empty();
         let model = if is_still { model.with_times(vec![0.0])? } else { model };
-        Ok(CheckpointModel { tensors: reader.tensors, model, description })
+        Ok(CheckpointModel { tensors: reader.tensors, model, checkpoint, description, seconds_per_state })
     }
 
     /// Returns the paths of the files in the model folder that are copied to the output.
     fn copied_files(&self) -> Vec<PathBuf> {
         const NAMES: [&str; 2] = ["cfg_args", "cameras.json"];
-        let Some(root) = &self.description.root else { return Vec::new() };
+        let Some(root) = &self.checkpoint.root else { return Vec::new() };
         let named = NAMES.iter().map(|name| root.join(name)).filter(|path| is_small(path));
         let mut found: Vec<PathBuf> = named.chain(yaml_files_in(root)).collect();
         found.sort();
         found
     }
 
-    /// Returns the function and options with which the model was opened, to open it again from an archive. Fails if the
-    /// model has none.
-    fn reopener(&self) -> Result<&Reopener> {
-        self.description.reopener.as_ref().ok_or_else(|| Error::internal("a model does not know how it was opened"))
-    }
-
     /// Returns the path of the checkpoint relative to the output folder.
     fn relative_path(&self) -> PathBuf {
-        let root = self.description.root.as_deref().or(self.description.file.parent()).unwrap_or(Path::new(""));
-        self.description.file.strip_prefix(root).unwrap_or(&self.description.file).to_owned()
+        let CheckpointFile { root, file, .. } = &self.checkpoint;
+        let root = root.as_deref().or(file.parent()).unwrap_or(Path::new(""));
+        file.strip_prefix(root).unwrap_or(file).to_owned()
     }
 
     /// Writes the compressed model to `path`: the checkpoint, and copies of the files beside it.
@@ -166,8 +201,9 @@ impl<L: ProxyRule> CheckpointModel<L> {
 }
 
 impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
-    fn kind(&self) -> &'static str {
-        self.description.kind
+    fn description(&self) -> ModelDescription {
+        let notes = [&self.description.notes[..], &self.model.motion_model().notes()].concat();
+        ModelDescription { notes, ..self.description.clone() }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -176,99 +212,38 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 
     fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
-        hash_file(&self.description.file, &mut hash)?;
+        hash_file(&self.checkpoint.file, &mut hash)?;
         self.model.motion_model().hash_settings(&mut hash);
         Ok(format!("{:032x}", hash.digest128()))
     }
 
-    fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.total())
-    }
-
     fn size(&self) -> Result<ModelSize> {
-        let rest = bytes_read_for(self.copied_files().iter().map(PathBuf::as_path))?;
-        Ok(ModelSize { cloud: bytes_read_for([&*self.description.file])?, rest, ..ModelSize::default() })
+        ModelSize::from_cloud_file(&self.checkpoint.file, self.copied_files())
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
-            OutputKind::Model => {
-                let cloud = bytes_read_for([&*path.join(self.relative_path())])?;
-                Ok(ModelSize { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..ModelSize::default() })
-            }
+            OutputKind::Model => ModelSize::from_folder(path, &path.join(self.relative_path())),
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
     fn memory_profile(&self) -> MemoryProfile {
-        let raw = self.model.raw();
-        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.format_specific.width() as u64;
+        let profile = self.model.memory_profile(self.seconds_per_state);
+        let whole = profile.per_gaussian;
         MemoryProfile {
-            per_gaussian: whole,
             // The widest tensor, both as stored and as f32.
             opening: 2 * whole,
-            // A copy of the stored parameters and the values prepared from them.
             reader: whole + 128,
-            compressed: 2 * whole,
-            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             // The training stores two optimizer values per parameter in addition.
             file: 3 * whole,
-            gaussian_block: GAUSSIAN_BLOCK as u64,
-            seconds_per_state: self.description.seconds_per_state,
-            ..MemoryProfile::default()
+            ..profile
         }
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        if self.model.motion_model().varying().is_empty() { TimeOrigin::Numbered } else { TimeOrigin::Continuous }
-    }
-
-    fn time_convention(&self) -> TimeConvention {
-        TimeConvention::Given
-    }
-
-    fn duration(&self) -> f64 {
-        self.model.motion_model().duration()
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        let CheckpointModel { tensors, model, description } = *self;
-        let found = model.info().times.len();
-        if !model.info().times.is_empty() && model.motion_model().varying().is_empty() && times.len() != found {
-            return Err(Error::usage(format!("{} times were given for {found} frames", times.len())));
-        }
-        let model = match model.motion_model().for_times(&times) {
-            Some(motion_model) => MotionModelFrames::new(motion_model, model.raw().clone(), model.info().sh_degree),
-            None => model,
-        };
-        Ok(Box::new(CheckpointModel { tensors, model: model.with_times(times)?, description }))
-    }
-
-    fn notes(&self) -> Vec<String> {
-        self.description.notes.iter().cloned().chain(self.model.motion_model().notes()).collect()
-    }
-
-    fn data_folder(&self) -> Option<&str> {
-        self.description.data_folder.as_deref()
-    }
-
-    fn background(&self) -> Option<[f32; 3]> {
-        self.description.white_background.then_some([1.0; 3])
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        OutputKind::Model
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        match kind {
-            OutputKind::Model | OutputKind::Archive => Ok(()),
-            _ => check_output(self.model.info().times.len(), kind, path),
-        }
-    }
-
-    fn reason_to_keep_sh_degree(&self) -> Option<&'static str> {
-        Some("loaders of the checkpoint expect coefficients of every degree")
+        let model = with_times(self.model, times, self.description.timing)?;
+        Ok(Box::new(CheckpointModel { model, ..*self }))
     }
 
     fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
@@ -279,7 +254,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
         let checkpoint = self.relative_path();
-        self.reopener()?.content(self, compressed, (self.default_output_kind(), "model"), |name| {
+        self.checkpoint.reopener.content(self, compressed, (OutputKind::Model, "model"), |name| {
             match Path::new(name) == checkpoint {
                 true => FileContent::Checkpoint(&self.tensors),
                 false => FileContent::Other,
@@ -288,7 +263,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
-        self.reopener()?.frames(content, &self.model.info().times)
+        self.checkpoint.reopener.frames(content, &self.model.info().times)
     }
 
     fn compressed_frames<'a>(&'a self, compressed: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
@@ -308,6 +283,27 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         }
         write_frames(&self.model, compressed, kind, path, limits.max_kept_frames, events)
     }
+}
+
+/// Returns `model` with frames at `times`, and with the motion model for these times. `timing` states whether the number
+/// of frames is fixed.
+///
+/// # Errors
+/// Fails if the number of frames is fixed and differs from the number of `times`, or if times do not increase.
+pub(super) fn with_times<L: ProxyRule>(
+    model: MotionModelFrames<L>,
+    times: Vec<f64>,
+    timing: TimeOrigin,
+) -> Result<MotionModelFrames<L>> {
+    let found = model.info().times.len();
+    if timing == TimeOrigin::Numbered && times.len() != found {
+        return Err(Error::usage(format!("{} times were given for {found} frames", times.len())));
+    }
+    let model = match model.motion_model().for_times(&times) {
+        Some(motion_model) => MotionModelFrames::new(motion_model, model.raw().clone(), model.info().sh_degree),
+        None => model,
+    };
+    model.with_times(times)
 }
 
 /// Writes the compressed model `compressed` of `model` to `path` as `kind`, any kind of output except
@@ -366,13 +362,13 @@ pub(super) fn yaml_files_in(root: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Returns the number and the path of each file in `folder` that is named `<prefix><number><suffix>`, in increasing
+/// Returns the number and the path of each file in `folder` that is named `<prefix><number><suffix>`, in decreasing
 /// order of the numbers.
-pub(super) fn numbered_files(folder: &Path, prefix: &str, suffix: &str) -> Vec<(u32, PathBuf)> {
+pub(super) fn numbered_files(folder: &Path, prefix: &str, suffix: &str) -> NumberedFiles {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let number = |name: &str| name.strip_prefix(prefix)?.strip_suffix(suffix)?.parse::<u32>().ok();
-    let mut found: Vec<(u32, PathBuf)> =
-        entries.filter_map(|entry| Some((number(entry.file_name().to_str()?)?, entry.path()))).collect();
-    found.sort();
+    let numbered = entries.filter_map(|entry| Some((Some(number(entry.file_name().to_str()?)?), entry.path())));
+    let mut found: NumberedFiles = numbered.collect();
+    found.sort_unstable_by(|a, b| b.cmp(a));
     found
 }

@@ -1,7 +1,5 @@
 //! Motion model of static Gaussians in a checkpoint.
 
-use xxhash_rust::xxh3::Xxh3;
-
 use super::ProxyRule;
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -43,6 +41,4 @@ impl ProxyRule for Still {
         raw.gaussians = gather_all(&merged, 0, Attributes::all())?;
         Ok(raw)
     }
-
-    fn hash_settings(&self, _: &mut Xxh3) {}
 }

@@ -17,7 +17,6 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::memory::TOGETHER_BYTES;
-use super::{LinkedFrames, Origin};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::frame_stream::FrameStream;
@@ -26,8 +25,9 @@ use crate::files::ply::write::write_inria;
 use crate::files::ply_frames::PlyFrames;
 use crate::fit::MIN_VISIBLE_OPACITY;
 use crate::model::{Attributes, Gaussians, opacity};
-use crate::models::InputModel;
+use crate::models::input_model::InputModel;
 use crate::models::trajectories::state_bytes;
+use crate::models::unpacked::{Original, Unpacked};
 use crate::outputs::container::{GAUSSIAN_BLOCK, gaussian_range};
 use crate::source::{FrameSource, Ids, ReadPlan};
 
@@ -68,7 +68,7 @@ impl ReceivedFrames {
     }
 
     /// Links the Gaussians of the received frames into tracks (Gaussians followed through frames) with the function
-    /// `link`. `kind` and `bytes` are the name of the original input's format, shown to users, and its size in bytes.
+    /// `link`, whose second argument is the memory in bytes that receiving the frames took. `kind` and `bytes` are the name of the original input's format, shown to users, and its size in bytes.
     ///
     /// # Errors
     /// Fails if `link` fails or the temporary files cannot be read.
@@ -76,13 +76,12 @@ impl ReceivedFrames {
         self,
         kind: &'static str,
         bytes: u64,
-        link: impl FnOnce(PlyFrames) -> Result<LinkedFrames>,
+        link: impl FnOnce(PlyFrames, u64) -> Result<Box<dyn InputModel>>,
         options: &PlyOptions,
-    ) -> Result<LinkedFrames> {
-        let linked = link(PlyFrames::open(self.folder.path(), options)?)?;
-        let memory = self.reader_bytes + 2 * self.largest_frame_bytes;
-        let origin = Some(Origin { _folder: self.folder, kind, bytes, memory });
-        Ok(LinkedFrames { info: linked.info.with_times(self.times)?, origin, ..linked })
+    ) -> Result<Box<dyn InputModel>> {
+        let frames = PlyFrames::open(self.folder.path(), options)?;
+        let linked = link(frames, self.reader_bytes + 2 * self.largest_frame_bytes)?.with_times(self.times)?;
+        Ok(Unpacked { _scratch: self.folder, kind, original: Original::Stamped(bytes) }.into_model(linked))
     }
 }
 

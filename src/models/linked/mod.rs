@@ -20,26 +20,26 @@ mod tracks;
 mod unlinked;
 mod write;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use xxhash_rust::xxh3::xxh3_128;
 
 use self::tracks::LinkedTracks;
 pub use self::unlinked::UnlinkedFrames;
-use super::size::bytes_read_for;
+use super::size::{ModelSize, file_bytes};
 use super::trajectories::write_trajectories;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
-use crate::files::atomic::{ScratchFile, ScratchFolder};
+use crate::files::atomic::ScratchFile;
 use crate::files::container::Container;
 use crate::files::ply::PlyOptions;
 use crate::files::ply_frames::PlyFrames;
 use crate::limits::Limits;
 use crate::model::SequenceInfo;
-use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
-use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadCounts, ReadPlan};
+use crate::source::{BlockReader, FrameSource, Ids, ReadCounts, ReadPlan};
 use crate::tracking::Joiner;
 
 /// Frames whose Gaussians have been linked into tracks (Gaussians followed through frames).
@@ -56,32 +56,27 @@ struct LinkedFrames {
     simplified_psnr: Option<f64>,
     /// Owner of the container's file; deletes the file when it is dropped.
     _scratch: ScratchFile,
-    /// Origin of frames that were unpacked from another input, such as a container or a stream; `None` if the user gave
-    /// PLY files.
-    origin: Option<Origin>,
-}
-
-/// Origin of frames that were first unpacked to temporary PLY files, such as those of a container or a stream.
-struct Origin {
-    /// Owner of the temporary PLY files of the frames; deletes them when it is dropped.
-    _folder: ScratchFolder,
-    /// Name of the original input format, shown to users.
-    kind: &'static str,
-    /// Size of the original input in bytes.
-    bytes: u64,
-    /// Peak bytes of memory that receiving or unpacking the frames took.
-    memory: u64,
+    /// Peak bytes of memory that receiving or unpacking the frames took; 0 if the user gave PLY files.
+    unpacking_bytes: u64,
 }
 
 impl LinkedFrames {
     /// Links the Gaussians of `frames` into tracks (Gaussians followed through frames). If `joins`, also joins tracks
     /// that seem to be the same Gaussian and makes nearly constant attributes constant. `why` is the reason for
-    /// linking, for the notes to the user; `name` is what messages call the frames.
+    /// linking, for the notes to the user; `name` is what messages call the frames. `unpacking_bytes` is the memory that
+    /// receiving or unpacking the frames took.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or has changed meanwhile, if linking needs more memory than `options` allow, or
     /// if a write fails.
-    fn new(frames: PlyFrames, name: &Path, why: &str, joins: bool, options: &PlyOptions) -> Result<LinkedFrames> {
+    fn new(
+        frames: PlyFrames,
+        name: &Path,
+        why: &str,
+        joins: bool,
+        unpacking_bytes: u64,
+        options: &PlyOptions,
+    ) -> Result<LinkedFrames> {
         let scratch = &*options.scratch;
         let not_read = frames.frame(0)?.header_notes();
         let mut joiner = joins.then(Joiner::default);
@@ -98,7 +93,7 @@ impl LinkedFrames {
         let psnrs = [joined.as_ref(), held.as_ref()].into_iter().flatten().filter_map(|step| step.psnr);
         let simplified_psnr = psnrs.reduce(f64::min);
         notes.extend(joined.into_iter().chain(held).map(|step| step.note).chain(not_read));
-        Ok(LinkedFrames { tracks, container, info, notes, simplified_psnr, _scratch: packed, origin: None })
+        Ok(LinkedFrames { tracks, container, info, notes, simplified_psnr, _scratch: packed, unpacking_bytes })
     }
 }
 
@@ -118,15 +113,24 @@ impl FrameSource for LinkedFrames {
     fn reads(&self) -> ReadCounts {
         self.container.reads()
     }
-
-    fn prefetcher(&self) -> Option<&dyn Prefetch> {
-        self.container.prefetcher()
-    }
 }
 
 impl InputModel for LinkedFrames {
-    fn kind(&self) -> &'static str {
-        self.origin.as_ref().map_or("linked PLY frames", |origin| origin.kind)
+    fn description(&self) -> ModelDescription {
+        ModelDescription {
+            kind: "linked PLY frames",
+            notes: self.notes.clone(),
+            has_explicit_frames: true,
+            archives_as_frames: true,
+            tracking_note: self.simplified_psnr.map(|psnr| {
+                format!(
+                    "its frames were linked, and its tracks joined or partly replaced by means, which changes its \
+                     renders: {psnr:.1} dB PSNR, the mean of a few renders; views can have less. --link apart compares \
+                     the frames as they are"
+                )
+            }),
+            ..ModelDescription::default()
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -139,27 +143,19 @@ impl InputModel for LinkedFrames {
         Ok(format!("{:032x}", xxh3_128(both.as_bytes())))
     }
 
-    fn bytes(&self) -> Result<u64> {
-        match &self.origin {
-            None => bytes_read_for(self.tracks.frames().paths().iter().map(PathBuf::as_path)),
-            Some(origin) => Ok(origin.bytes),
-        }
+    fn size(&self) -> Result<ModelSize> {
+        Ok(ModelSize::from_frames(file_bytes(self.tracks.frames().paths())?))
     }
 
     fn stored_bytes(&self) -> Result<u64> {
         self.container.bytes()
     }
 
-    fn has_explicit_frames(&self) -> bool {
-        true
-    }
-
     fn memory_profile(&self) -> MemoryProfile {
         let (sizes, count) = (self.tracks.sizes(), self.info.count.max(1) as u64);
-        let receiving = self.origin.as_ref().map_or(0, |origin| origin.memory);
         MemoryProfile {
             per_gaussian: sizes.open().div_ceil(count),
-            opening: sizes.opening().max(receiving).div_ceil(count),
+            opening: sizes.opening().max(self.unpacking_bytes).div_ceil(count),
             file: sizes.frame_file().div_ceil(count),
             ..self.container.memory_profile()
         }
@@ -169,29 +165,9 @@ impl InputModel for LinkedFrames {
         InputModel::hold_decoded(&self.container);
     }
 
-    fn timing(&self) -> TimeOrigin {
-        match self.origin {
-            None => TimeOrigin::Numbered,
-            Some(_) => TimeOrigin::Stamped,
-        }
-    }
-
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         self.info = self.info.with_times(times)?;
         Ok(self)
-    }
-
-    fn notes(&self) -> Vec<String> {
-        self.notes.clone()
-    }
-
-    fn tracking_note(&self) -> Option<String> {
-        let psnr = self.simplified_psnr?;
-        Some(format!(
-            "its frames were linked, and its tracks joined or partly replaced by means, which changes its renders: \
-             {psnr:.1} dB PSNR, the mean of a few renders; views can have less. --link apart compares the frames as they \
-             are"
-        ))
     }
 
     fn write(

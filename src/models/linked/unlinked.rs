@@ -14,6 +14,7 @@ use crate::files::frame_stream::FrameStream;
 use crate::files::ply::PlyOptions;
 use crate::files::ply_frames::PlyFrames;
 use crate::models::input_model::{InputModel, LinkMode, OpenOptions, TimeOrigin};
+use crate::models::unpacked::Unpacked;
 
 /// Opened frames whose Gaussians are to be linked into tracks (Gaussians followed through frames).
 pub struct UnlinkedFrames {
@@ -25,12 +26,9 @@ pub struct UnlinkedFrames {
     /// Whether tracks that seem to be the same Gaussian are joined.
     joins: bool,
     options: PlyOptions,
-    /// Function that turns the linked frames into a model of the input format.
-    wrap: WrapModel,
+    /// Original of frames that were unpacked from other files; `None` if the user gave PLY files or a stream.
+    original: Option<Unpacked>,
 }
-
-/// Function that makes a model of another format from a model whose frames it shares.
-type WrapModel = Box<dyn FnOnce(Box<dyn InputModel>) -> Box<dyn InputModel> + Send + Sync>;
 
 /// Where frames that are to be linked come from.
 enum Frames {
@@ -79,24 +77,12 @@ impl UnlinkedFrames {
 
     fn new(frames: Frames, name: &Path, why: String, options: &OpenOptions) -> UnlinkedFrames {
         let joins = options.link.joins_tracks();
-        UnlinkedFrames {
-            frames,
-            name: name.to_owned(),
-            why,
-            joins,
-            options: options.ply(),
-            wrap: Box::new(|model| model),
-        }
+        UnlinkedFrames { frames, name: name.to_owned(), why, joins, options: options.ply(), original: None }
     }
 
-    /// Returns the frames as those of an input of another format: `wrap` is called with the model after linking and
-    /// returns the model of that format.
-    pub(in crate::models) fn wrapped(
-        self,
-        wrap: impl FnOnce(Box<dyn InputModel>) -> Box<dyn InputModel> + Send + Sync + 'static,
-    ) -> UnlinkedFrames {
-        let inner = self.wrap;
-        UnlinkedFrames { wrap: Box::new(|model| wrap(inner(model))), ..self }
+    /// Returns the frames as those of the input that was unpacked into `original`.
+    pub(in crate::models) fn with_original(self, original: Unpacked) -> UnlinkedFrames {
+        UnlinkedFrames { original: Some(original), ..self }
     }
 
     /// Returns the reason for linking, for messages to the user.
@@ -129,15 +115,20 @@ impl UnlinkedFrames {
     /// Fails if a frame cannot be read or has changed since it was opened, if linking needs more memory than the
     /// options allow, or if a write fails.
     pub fn link(self) -> Result<Box<dyn InputModel>> {
-        let UnlinkedFrames { frames, name, why, joins, options, wrap } = self;
-        let link = |frames| LinkedFrames::new(frames, &name, &why, joins, &options);
+        let UnlinkedFrames { frames, name, why, joins, options, original } = self;
+        let link = |frames, unpacking_bytes| -> Result<Box<dyn InputModel>> {
+            Ok(Box::new(LinkedFrames::new(frames, &name, &why, joins, unpacking_bytes, &options)?))
+        };
         let linked = match frames {
-            Frames::Files(frames) => link(frames)?,
+            Frames::Files(frames) => link(frames, 0)?,
             Frames::Received { frames, bytes } => frames.link("linked frame stream", bytes, link, &options)?,
             Frames::Model { input, kind } => {
                 unpack_visible(&*input, &options)?.link(kind, input.bytes()?, link, &options)?
             }
         };
-        Ok(wrap(Box::new(linked)))
+        Ok(match original {
+            Some(original) => original.into_model(linked),
+            None => linked,
+        })
     }
 }

@@ -16,6 +16,9 @@ use rayon::prelude::*;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams, vectorized};
+use crate::models::input_model::MemoryProfile;
+use crate::models::trajectories::state_bytes;
+use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
 use crate::source::{
     BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, PreparedDeformation, ReadCounts, ReadPlan,
@@ -126,6 +129,27 @@ impl<L: MotionModel> MotionModelFrames<L> {
     /// Returns the stored parameters of all Gaussians.
     pub(super) fn raw(&self) -> &StoredParams {
         &self.raw
+    }
+
+    /// Returns the memory profile of a model that keeps the stored parameters in memory. `seconds_per_state` is the
+    /// approximate CPU seconds on one core to compute the state of one Gaussian at one frame.
+    pub(super) fn memory_profile(&self, seconds_per_state: f64) -> MemoryProfile {
+        let whole = state_bytes(self.raw.gaussians.sh_degree(), Attributes::all())
+            + 4 * self.raw.format_specific.width() as u64;
+        MemoryProfile {
+            per_gaussian: whole,
+            // A copy of the parameters while they are read.
+            opening: whole,
+            // A copy of the stored parameters and the values prepared from them.
+            reader: whole + 16 + 8,
+            compressed: 2 * whole,
+            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
+            // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
+            file: whole + 24,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            seconds_per_state,
+            ..MemoryProfile::default()
+        }
     }
 
     /// Returns the model with frames at `times`.

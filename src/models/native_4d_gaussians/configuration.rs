@@ -4,9 +4,8 @@
 use std::path::Path;
 
 use crate::error::{Error, Result, quoted};
-use crate::files::python_literal::{Literal, parse_call};
 use crate::files::text::read_text;
-use crate::models::four_d_gaussians::cfg_args;
+use crate::models::cfg_args::Arguments;
 use crate::models::in_checkpoint::yaml_files_in;
 
 /// Values of the training configuration that affect how the model is read or rendered.
@@ -27,22 +26,15 @@ impl TrainingConfig {
     /// # Errors
     /// Fails if a file cannot be read or parsed, or if two files contradict each other.
     pub(super) fn read(root: &Path) -> Result<TrainingConfig> {
-        let mut found = TrainingConfig { time_duration: time_duration(root)?, ..TrainingConfig::default() };
+        let time_duration = time_duration(root)?;
         let path = root.join("cfg_args");
-        if !path.is_file() {
-            return Ok(found);
-        }
-        let text = cfg_args::read(&path)?;
-        let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(&path, &text))?;
-        for argument in arguments {
-            match (argument.name.as_str(), argument.value) {
-                ("source_path", Literal::Str(path)) => found.source_path = Some(path),
-                ("white_background", Literal::Bool(is_white)) => found.white_background = is_white,
-                ("prefilter_var", Literal::Float(variance)) => found.prefilter = variance,
-                _ => (),
-            }
-        }
-        Ok(found)
+        let arguments = if path.is_file() { Arguments::read(&path)? } else { Arguments::default() };
+        Ok(TrainingConfig {
+            source_path: arguments.get("source_path").string()?,
+            white_background: arguments.get("white_background").bool(false)?,
+            prefilter: arguments.get("prefilter_var").float(0.0)?,
+            time_duration,
+        })
     }
 }
 

@@ -11,22 +11,22 @@ mod frame_state;
 mod proxies;
 mod rotation;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::archive::reopen::Reopener;
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{
-    CheckpointModel, CheckpointReader, ModelDescription, ProxyRule, RowElement, numbered_files, row_count,
+    CheckpointFile, CheckpointModel, CheckpointReader, NumberedFiles, ProxyRule, RowElement, numbered_files, row_count,
 };
 use crate::compressed_model::Cluster;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::files::checkpoint::{Checkpoint, Node, NodeId, Pickle};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, StoredParams, sh_coefficient_count};
-use crate::models::input_model::{InputModel, ModelFormat, OpenOptions, TrainingConventions};
+use crate::models::input_model::{ModelDescription, OpenOptions, TrainingConventions};
 use crate::models::motion_model::MotionModelFrames;
+use crate::models::opened::{InputFormat, Opened};
 use crate::recipe::MergeParams;
 use configuration::TrainingConfig;
 use frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
@@ -38,38 +38,25 @@ const CAPTURE_LENGTH_STATIC: usize = 12;
 
 /// Model format of 4D Gaussian Splatting in its native form: recognizes and opens a training checkpoint, or the model
 /// folder that contains it.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| match found.is_folder {
         // Other formats also save checkpoints beside a folder `point_cloud`, so the capture must be that of a 4D model.
         true if found.path.join("point_cloud").is_dir() => {
-            checkpoints(found.path).iter().any(|path| has_capture(path, &[CAPTURE_LENGTH_4D], found.memory))
+            checkpoints(found.path).iter().any(|(_, path)| has_capture(path, &[CAPTURE_LENGTH_4D], found.memory))
         }
         true => !checkpoints(found.path).is_empty(),
         false => {
             found.is_checkpoint() && has_capture(found.path, &[CAPTURE_LENGTH_4D, CAPTURE_LENGTH_STATIC], found.memory)
         }
     },
-    open: |path, options| {
-        let description = match path.is_dir() {
-            true => {
-                let (file, notes) = choose(path, options)?;
-                ModelDescription { root: Some(path.to_owned()), file, notes, ..ModelDescription::default() }
-            }
-            false => {
-                options.refuse_for(path)?;
-                ModelDescription { file: path.to_owned(), ..ModelDescription::default() }
-            }
-        };
-        open(description, options)
-    },
+    open,
 };
 
-/// Returns the paths of the checkpoints in `folder`: the best one if it exists, then those of iterations, last one
-/// first.
-fn checkpoints(folder: &Path) -> Vec<PathBuf> {
-    let best = folder.join("chkpnt_best.pth");
-    let by_number = numbered_files(folder, "chkpnt", ".pth").into_iter().rev().map(|(_, path)| path);
-    best.is_file().then_some(best).into_iter().chain(by_number).collect()
+/// Returns the paths of the checkpoints in `folder` with their training iterations: the best one if it exists, then those
+/// of numbered iterations, last one first.
+fn checkpoints(folder: &Path) -> NumberedFiles {
+    let best = Some((None, folder.join("chkpnt_best.pth"))).filter(|(_, path)| path.is_file());
+    best.into_iter().chain(numbered_files(folder, "chkpnt", ".pth")).collect()
 }
 
 /// Returns whether the checkpoint at `path` is a pair: a capture tuple (the saved training state) and an iteration
@@ -83,28 +70,6 @@ fn has_capture(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
             pickle.int(iteration).is_some() && lengths.iter().any(|&expected| length == Some(expected))
         }
         _ => false,
-    }
-}
-
-/// Returns the path of the checkpoint of the requested iteration. Without a request, returns the best one, or the last
-/// if there is no best one; a note is added if there are several.
-fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
-    let found = checkpoints(folder);
-    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let names = || found.iter().map(|path| name(path)).collect::<Vec<_>>().join(", ");
-    match options.iteration {
-        Some(k) => {
-            let wanted = format!("chkpnt{k}.pth");
-            let file = found.iter().find(|path| name(path) == wanted);
-            Ok((file.ok_or_else(|| Error::input(folder, "", wanted, names()))?.clone(), Vec::new()))
-        }
-        None => {
-            let Some(file) = found.first() else {
-                return Err(Error::input(folder, "", "a file chkpnt<K>.pth", "none"));
-            };
-            let note = format!("found {}: {} is read (choose another with --iteration)", names(), name(file));
-            Ok((file.clone(), if found.len() > 1 { vec![note] } else { Vec::new() }))
-        }
     }
 }
 
@@ -170,11 +135,10 @@ fn place(i: usize, name: &str) -> String {
 }
 
 /// Opens a checkpoint as a 4D or a static model.
-fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
-    let reopener = Some(Reopener::new(ENTRY.open, options));
-    let description = ModelDescription { reopener, ..description };
+fn open(path: &Path, options: &OpenOptions) -> Result<Opened> {
+    let file = CheckpointFile::find(path, options, checkpoints, "chkpnt<K>.pth", open)?;
     let conventions = options.conventions;
-    let checkpoint = Checkpoint::open(&description.file, options.memory)?;
+    let checkpoint = Checkpoint::open(&file.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let capture = match pickle.elements(pickle.root()) {
         Some(&[capture, _]) => capture,
@@ -187,7 +151,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
             .hint("export its frames with its own renderer, as PLY files or as a frame stream, and give those"));
     }
     let is_4d = capture_values.len() == CAPTURE_LENGTH_4D;
-    let root = description.root.as_deref().or(description.file.parent());
+    let root = file.root.as_deref().or(file.file.parent());
     let config = root.map_or_else(|| Ok(TrainingConfig::default()), TrainingConfig::read)?;
     let part = |i: usize, name: &str| (capture_values[i], place(i, name));
     let (xyz, place) = part(1, "xyz");
@@ -203,7 +167,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         true => Some(motion_model(&checkpoint, &capture_values, &config, &conventions, stored_terms)?),
         false => None,
     };
-    let mut notes = description.notes.clone();
+    let mut notes = Vec::from_iter(file.note.clone());
     if is_4d && !matches!(pickle.node(capture_values[17]), Node::None) {
         notes.push("the environment map of the model (its sky) is neither rendered nor compared".to_owned());
     }
@@ -236,17 +200,18 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         }
     }
     training_nodes.into_iter().for_each(|id| reader.add_training_tensor(id));
+    let given_period = motion_model.as_ref().and_then(|motion_model| motion_model.given_period);
     let description = ModelDescription {
         kind: if is_4d { "4D Gaussian Splatting checkpoint" } else { "3D Gaussian Splatting checkpoint" },
-        data_folder: config.source_path,
-        white_background: config.white_background,
-        seconds_per_state: if is_4d { 6e-8 } else { 1e-8 },
         notes,
-        ..description
+        duration: given_period.unwrap_or(1.0),
+        data_folder: config.source_path,
+        background: config.white_background.then_some([1.0; 3]),
+        ..ModelDescription::default()
     };
     Ok(match motion_model {
-        Some(motion_model) => Box::new(CheckpointModel::new(reader, motion_model, description)?),
-        None => Box::new(CheckpointModel::new(reader, Still, description)?),
+        Some(motion_model) => Opened::from_model(CheckpointModel::new(reader, motion_model, file, 6e-8, description)?),
+        None => Opened::from_model(CheckpointModel::new(reader, Still, file, 1e-8, description)?),
     })
 }
 
@@ -278,10 +243,6 @@ impl ProxyRule for Native {
              --time-duration to the value of its training configuration)",
             self.period
         )]
-    }
-
-    fn duration(&self) -> f64 {
-        self.given_period.unwrap_or(1.0)
     }
 }
 

@@ -7,6 +7,8 @@
 //! 2024, this matrix is R with its rows and its columns in reversed order; in older ones it is R itself. Source:
 //! `build_rotation_4d` of the repository fudan-zvg/4d-gaussian-splatting on GitHub.
 
+use glam::DMat4;
+
 /// 4×4 matrix, row by row.
 pub(super) type Matrix = [[f64; 4]; 4];
 
@@ -118,16 +120,9 @@ pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
     (scales, rotation)
 }
 
-/// Returns the determinant of a matrix, by expansion along the first row.
+/// Returns the determinant of a matrix.
 fn determinant(a: &Matrix) -> f64 {
-    let minor = |row: [usize; 3], column: [usize; 3]| {
-        let entry = |i: usize, j: usize| a[row[i]][column[j]];
-        entry(0, 0) * (entry(1, 1) * entry(2, 2) - entry(1, 2) * entry(2, 1))
-            - entry(0, 1) * (entry(1, 0) * entry(2, 2) - entry(1, 2) * entry(2, 0))
-            + entry(0, 2) * (entry(1, 0) * entry(2, 1) - entry(1, 1) * entry(2, 0))
-    };
-    let columns = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
-    (0..4).map(|j| if j % 2 == 0 { 1.0 } else { -1.0 } * a[0][j] * minor([1, 2, 3], columns[j])).sum()
+    DMat4::from_cols_array_2d(a).determinant()
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DMat4, DVec4};
 
@@ -14,6 +14,7 @@ use crate::models::OpenOptions;
 use crate::models::TrainingConventions;
 use crate::models::archive::checks::check_round_trip;
 use crate::models::in_checkpoint::linear::covariance;
+use crate::models::input_model::InputModel;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::progress::Events;
@@ -193,7 +194,10 @@ fn states_are_4d_slices_in_both_conventions() {
     let root = folder.put(capture(true));
     for unflipped in [false, true] {
         let model = open_as(&root, unflipped).unwrap();
-        assert_eq!((model.kind(), model.background()), ("4D Gaussian Splatting checkpoint", Some([1.0; 3])));
+        assert_eq!(
+            (model.description().kind, model.description().background),
+            ("4D Gaussian Splatting checkpoint", Some([1.0; 3]))
+        );
         for (state, time) in states(&*model).iter().zip(TIMES) {
             (0..COUNT).for_each(|row| check(&parameters(true), !unflipped, row, time, state));
         }
@@ -293,7 +297,7 @@ fn static_capture_is_read_as_static_model() {
     parts[3] = PythonValue::Parameter(tensor(2, &[COUNT, 15, 3], &noise(45 * COUNT, 3.0)));
     let root = folder.put(parts);
     let model = models::open(&root, &OpenOptions::default()).unwrap().into_linked().unwrap();
-    assert_eq!(model.kind(), "3D Gaussian Splatting checkpoint");
+    assert_eq!(model.description().kind, "3D Gaussian Splatting checkpoint");
     let state = gather_all(model.source(), 0, Attributes::all()).unwrap();
     assert_eq!(f64::from(state.sh.plane(5)[2]), floats(&tensor(0, &[COUNT, 45], &noise(45 * COUNT, 3.0)), 2)[2]);
     let result = folder.written(&*model, &CompressedModel::pruned(vec![2], &rule()));
@@ -344,19 +348,26 @@ fn best_or_requested_checkpoint_is_read() {
     let folder = CheckpointFolder::new();
     let root = folder.put(capture(true));
     fs::copy(root.join("chkpnt30000.pth"), root.join("chkpnt_best.pth")).unwrap();
-    let notes = models::open(&root, &OpenOptions::default()).unwrap().into_linked().unwrap().notes();
+    let notes = models::open(&root, &OpenOptions::default()).unwrap().into_linked().unwrap().description().notes;
     assert!(notes.iter().any(|note| note.contains("chkpnt_best.pth is read")), "{notes:?}");
     assert!(notes.iter().any(|note| note.contains("--time-duration")), "{notes:?}");
     let open_iteration = |iteration| {
         models::open(&root, &OpenOptions { iteration: Some(iteration), ..OpenOptions::default() })
             .and_then(models::Opened::into_linked)
     };
-    assert!(open_iteration(30_000).unwrap().notes().iter().all(|note| !note.contains("best")));
+    assert!(open_iteration(30_000).unwrap().description().notes.iter().all(|note| !note.contains("best")));
     let error = open_iteration(7).err().unwrap().to_string();
     assert!(error.contains("chkpnt7.pth") && error.contains("chkpnt30000.pth"), "{error}");
     // The guessed period of colors depends on the frame times.
     let at = |times: Vec<f64>| {
-        models::open(&root, &OpenOptions::default()).unwrap().into_linked().unwrap().with_times(times).unwrap().notes()
+        models::open(&root, &OpenOptions::default())
+            .unwrap()
+            .into_linked()
+            .unwrap()
+            .with_times(times)
+            .unwrap()
+            .description()
+            .notes
     };
     assert!(at(vec![0.0, 1.0]).iter().any(|note| note.contains("every 1 ")), "{:?}", at(vec![0.0]));
     assert!(at(vec![0.0, 1.5]).iter().any(|note| note.contains("every 10 ")));

@@ -14,20 +14,21 @@ mod nodes;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use super::cfg_args::Arguments;
 use super::deform_folder::{
-    Arguments, DeformFolder, MIN_SCALE, ModelParts, NetworkMotionModel, has_network, network_tensor_names,
+    DeformFolder, MIN_SCALE, ModelParts, NetworkMotionModel, has_network, network_tensor_names,
 };
 use crate::deform::{EncodedPositions, Network, PredictedMotion};
 use crate::error::{Error, Result, quoted};
 use crate::model::exp_log::{exp, ln};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, logit, opacity};
-use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
+use crate::models::opened::InputFormat;
 use nodes::Nodes;
 
 /// Model format of SC-GS: recognizes and opens a model folder. A key of its configuration, or control nodes among its
 /// tensors, distinguish it from Deformable-3D-Gaussians.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| {
         let typed = || {
             let arguments = Arguments::read(&found.path.join("cfg_args")).ok();

@@ -7,7 +7,6 @@
 //! three features have without the network.
 
 mod cloud;
-mod common;
 mod decoder;
 mod frame_state;
 mod motion;
@@ -15,36 +14,35 @@ mod proxies;
 mod splatv;
 
 use std::fs;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::archive::pack::FileContent;
 use super::archive::reopen::Reopener;
+use super::cfg_args::Arguments;
 use super::files::copy;
 use super::iterations::find_iteration;
-use super::size::{ModelSize, bytes_below, bytes_read_for};
+use super::size::{ModelSize, NO_FILES, bytes_below};
 use super::trajectories::write_sequence;
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result, quoted};
 use crate::files::cameras::TimeConvention;
 use crate::files::digest::digest_of_files;
-use crate::files::open::open_file;
-use crate::files::python_literal::{Literal, parse_call};
+use crate::files::ply::header_contains;
+use crate::files::python_literal::Literal;
 use crate::files::state_dict::read_state_dict;
-use crate::files::text::read_text;
 use crate::limits::Limits;
 use crate::model::{StoredParams, color_from_sh};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, OpenOptions, TimeOrigin};
 use crate::models::motion_model::{MotionModelFrames, compressed_raw, propose_proxies};
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 use cloud::{MARKER_PROPERTY, PointCloudFile};
-use common::{check_kind, memory_profile};
 use decoder::{ColorActivation, ColorDecoder};
-use frame_state::{FULL_PARAM_COUNT, SHARED_PARAM_COUNT, Spacetime};
+use frame_state::Spacetime;
 pub(super) use splatv::SPLATV;
 
 /// Name of the folder that holds the folders `iteration_K`.
@@ -59,22 +57,18 @@ const CFG_ARGS: &str = "cfg_args";
 const CAMERAS: &str = "cameras.json";
 
 /// Model format of SpacetimeGaussians: recognizes and opens a model folder, or its PLY file.
-pub(super) const ENTRY: ModelFormat = ModelFormat {
+pub(super) const ENTRY: InputFormat = InputFormat {
     recognizes: |found| match found.is_folder {
         true => find_iteration(&found.path.join(POINT_CLOUD_FOLDER), None)
             .is_ok_and(|(_, folder)| has_marker_property(&folder.join(POINT_CLOUD_FILE))),
         false => found.is_file_of(b"ply", "ply") && has_marker_property(found.path),
     },
-    open: |path, options| Ok(Box::new(SpacetimeGaussians::open(path, options)?)),
+    open: |path, options| Ok(Opened::from_model(SpacetimeGaussians::open(path, options)?)),
 };
 
 /// Returns whether the header of the PLY at `path` has a property that only SpacetimeGaussians writes.
 pub(super) fn has_marker_property(path: &Path) -> bool {
-    // The header of any PLY file of this format fits into 16 KiB; the rest of the file is not read.
-    let mut head = Vec::new();
-    let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
-    let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
-    read && header.windows(MARKER_PROPERTY.len()).any(|bytes| bytes == MARKER_PROPERTY.as_bytes())
+    header_contains(path, MARKER_PROPERTY)
 }
 
 /// Paths of the files of a SpacetimeGaussians model.
@@ -111,34 +105,14 @@ impl Files {
     }
 }
 
-/// Values of `cfg_args` that are used when the model is opened.
-#[derive(Debug, Clone, Default)]
-struct SpacetimeConfig {
-    source_path: Option<String>,
-    rgb_function: Option<String>,
-    /// Number n of training frames (key `duration`). Frame i, counted from 0, has the time i/n.
-    duration: Option<usize>,
-}
-
-impl SpacetimeConfig {
-    /// Reads the values that opening a model needs from the `cfg_args` file at `path`.
-    fn read(path: &Path) -> Result<SpacetimeConfig> {
-        let text = read_text(path, 1 << 20)?;
-        let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;
-        let named = |name: &str| arguments.iter().rev().find(|argument| argument.name == name);
-        let text_of = |name: &str| match named(name).map(|argument| &argument.value) {
-            None | Some(Literal::None) => Ok(None),
-            Some(Literal::Str(text)) => Ok(Some(text.clone())),
-            Some(other) => Err(Error::input(path, format!("key {name}"), "a string", other.to_string())),
-        };
-        let duration = match named("duration").map(|argument| &argument.value) {
-            None | Some(Literal::None) => None,
-            Some(Literal::Int(frames)) if (1..=i64::from(u32::MAX)).contains(frames) => Some(*frames as usize),
-            Some(other) => {
-                return Err(Error::input(path, "key duration", "a number of frames, at least 1", other.to_string()));
-            }
-        };
-        Ok(SpacetimeConfig { source_path: text_of("source_path")?, rgb_function: text_of("rgbfunction")?, duration })
+/// Returns the number n of training frames, the value of the key `duration`; `None` if it is missing. Frame i, counted
+/// from 0, has the time i/n. Fails if the value is not a positive integer.
+fn training_frames(arguments: &Arguments) -> Result<Option<usize>> {
+    let duration = arguments.get("duration");
+    match duration.value {
+        Literal::None => Ok(None),
+        Literal::Int(frames) if (1..=i64::from(u32::MAX)).contains(frames) => Ok(Some(*frames as usize)),
+        _ => Err(duration.wrong("a number of frames, at least 1")),
     }
 }
 
@@ -148,9 +122,8 @@ struct SpacetimeGaussians {
     files: Files,
     cloud: PointCloudFile,
     model: MotionModelFrames<Spacetime>,
-    configuration: SpacetimeConfig,
     activation: ColorActivation,
-    notes: Vec<String>,
+    description: ModelDescription,
     reopener: Reopener,
 }
 
@@ -159,10 +132,9 @@ impl SpacetimeGaussians {
     fn open(path: &Path, options: &OpenOptions) -> Result<SpacetimeGaussians> {
         let files = Files::find(path, options)?;
         let cloud = PointCloudFile::open(&files.cloud, &options.ply())?;
-        let configuration =
-            files.root_file(CFG_ARGS).map(|path| SpacetimeConfig::read(&path)).transpose()?.unwrap_or_default();
+        let arguments = files.root_file(CFG_ARGS).map(|path| Arguments::read(&path)).transpose()?.unwrap_or_default();
         let mut notes = Vec::new();
-        let activation = match configuration.rgb_function.as_deref() {
+        let activation = match arguments.get("rgbfunction").string()?.as_deref() {
             _ if !cloud.is_full() => ColorActivation::None,
             None => {
                 notes.push(
@@ -206,7 +178,19 @@ impl SpacetimeGaussians {
         notes.extend(cloud.notes()?);
         let model = MotionModelFrames::new(Spacetime { is_full: cloud.is_full(), decoder }, raw, 0);
         let reopener = Reopener::new(ENTRY.open, options);
-        Ok(SpacetimeGaussians { files, cloud, model, configuration, activation, notes, reopener })
+        let description = ModelDescription {
+            kind: if cloud.is_full() { "SpacetimeGaussians full model" } else { "SpacetimeGaussians lite model" },
+            notes,
+            timing: TimeOrigin::Continuous,
+            time_convention: TimeConvention::Given,
+            data_folder: arguments.get("source_path").string()?,
+            data_frames: training_frames(&arguments)?,
+            // Training ignores `white_background` of `cfg_args`.
+            background: Some([0.0; 3]),
+            default_output_kind: if files.folder.is_some() { OutputKind::Model } else { OutputKind::Ply },
+            ..ModelDescription::default()
+        };
+        Ok(SpacetimeGaussians { files, cloud, model, activation, description, reopener })
     }
 
     /// Writes the compressed model as a model folder at `path`.
@@ -237,8 +221,8 @@ fn negative_color_note(raw: &StoredParams) -> Option<String> {
 }
 
 impl InputModel for SpacetimeGaussians {
-    fn kind(&self) -> &'static str {
-        if self.cloud.is_full() { "SpacetimeGaussians full model" } else { "SpacetimeGaussians lite model" }
+    fn description(&self) -> ModelDescription {
+        self.description.clone()
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -250,68 +234,28 @@ impl InputModel for SpacetimeGaussians {
         digest_of_files([&*self.files.cloud].into_iter().chain(other_files.iter().map(AsRef::as_ref)))
     }
 
-    fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.total())
-    }
-
     fn size(&self) -> Result<ModelSize> {
-        let other = self.files.other_files();
-        let (cloud, rest) =
-            (bytes_read_for([&*self.files.cloud])?, bytes_read_for(other.iter().map(PathBuf::as_path))?);
-        Ok(ModelSize { cloud, rest, ..ModelSize::default() })
+        ModelSize::from_cloud_file(&self.files.cloud, self.files.other_files())
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
-            OutputKind::Model => Files::find(path, &OpenOptions::default()).and_then(|files| {
-                let other = files.other_files();
-                let (cloud, rest) =
-                    (bytes_read_for([&*files.cloud])?, bytes_read_for(other.iter().map(PathBuf::as_path))?);
-                Ok(ModelSize { cloud, rest, ..ModelSize::default() })
-            }),
-            OutputKind::Ply | OutputKind::Splatv => {
-                Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() })
+            OutputKind::Model => {
+                let files = Files::find(path, &OpenOptions::default())?;
+                ModelSize::from_cloud_file(&files.cloud, files.other_files())
             }
+            OutputKind::Ply | OutputKind::Splatv => ModelSize::from_cloud_file(path, NO_FILES),
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
     fn memory_profile(&self) -> MemoryProfile {
-        memory_profile(if self.cloud.is_full() { FULL_PARAM_COUNT } else { SHARED_PARAM_COUNT })
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Continuous
-    }
-
-    fn time_convention(&self) -> TimeConvention {
-        TimeConvention::Given
+        self.model.memory_profile(4e-8)
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         self.model = self.model.with_times(times)?;
         Ok(self)
-    }
-
-    fn notes(&self) -> Vec<String> {
-        self.notes.clone()
-    }
-
-    fn data_folder(&self) -> Option<&str> {
-        self.configuration.source_path.as_deref()
-    }
-
-    fn data_frames(&self) -> Option<usize> {
-        self.configuration.duration
-    }
-
-    /// Returns black as the background color: training ignores `white_background` of `cfg_args`.
-    fn background(&self) -> Option<[f32; 3]> {
-        Some([0.0; 3])
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        if self.files.folder.is_some() { OutputKind::Model } else { OutputKind::Ply }
     }
 
     fn keeps_motion(&self, kind: OutputKind) -> bool {
@@ -323,7 +267,11 @@ impl InputModel for SpacetimeGaussians {
             OutputKind::Model if self.files.folder.is_none() => {
                 Err(Error::usage("a PLY alone cannot be written as a model folder\n  give the folder, or write a .ply"))
             }
-            _ => check_kind(kind, self.cloud.is_full()),
+            OutputKind::Splatv if self.cloud.is_full() => Err(Error::usage(
+                "a .splatv stores colors, not features: it holds only lite models of SpacetimeGaussians\n  write a \
+                 model folder or a .gseq",
+            )),
+            _ => Ok(()),
         }
     }
 
@@ -334,7 +282,12 @@ impl InputModel for SpacetimeGaussians {
     }
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, compressed, (self.default_output_kind(), "model.ply"), FileContent::from_name)
+        self.reopener.content(
+            self,
+            compressed,
+            (self.description.default_output_kind, "model.ply"),
+            FileContent::from_name,
+        )
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

@@ -7,7 +7,6 @@
 use std::fs;
 use std::path::Path;
 
-use super::common::{check_kind, memory_profile};
 use super::decoder::ColorActivation;
 use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, SHARED_PARAM_COUNT, Spacetime};
 use super::proxies;
@@ -28,10 +27,11 @@ use crate::model::{
 };
 use crate::models::archive::pack::FileContent;
 use crate::models::archive::reopen::Reopener;
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, OpenOptions, TimeOrigin};
 use crate::models::motion_model::window::MAX_LOGIT;
 use crate::models::motion_model::{MotionModelFrames, compressed_raw, propose_proxies};
-use crate::models::size::{ModelSize, bytes_below, bytes_read_for};
+use crate::models::opened::{InputFormat, Opened};
+use crate::models::size::{ModelSize, NO_FILES, bytes_below};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -48,11 +48,11 @@ const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
 
 /// Model format of `.splatv` files, which hold a compressed SpacetimeGaussians lite model for web players: recognizes
 /// and opens a file.
-pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
+pub(in super::super) const SPLATV: InputFormat = InputFormat {
     recognizes: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
         options.refuse_for(path)?;
-        Ok(Box::new(SplatvModel::open(path, options)?))
+        Ok(Opened::from_model(SplatvModel::open(path, options)?))
     },
 };
 
@@ -156,8 +156,16 @@ pub(super) fn write(
 }
 
 impl InputModel for SplatvModel {
-    fn kind(&self) -> &'static str {
-        "splaTV model"
+    fn description(&self) -> ModelDescription {
+        ModelDescription {
+            kind: "splaTV model",
+            notes: self.defects.notes().into_iter().chain(self.file.note()).collect(),
+            timing: TimeOrigin::Continuous,
+            time_convention: TimeConvention::Given,
+            background: Some([0.0; 3]),
+            default_output_kind: OutputKind::Splatv,
+            ..ModelDescription::default()
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -168,50 +176,26 @@ impl InputModel for SplatvModel {
         digest_of_files([self.file.path()])
     }
 
-    fn bytes(&self) -> Result<u64> {
-        bytes_read_for([self.file.path()])
-    }
-
     fn size(&self) -> Result<ModelSize> {
-        Ok(ModelSize { cloud: self.bytes()?, ..ModelSize::default() })
+        ModelSize::from_cloud_file(self.file.path(), NO_FILES)
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
-            OutputKind::Splatv => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
+            OutputKind::Splatv => ModelSize::from_cloud_file(path, NO_FILES),
             _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
     fn memory_profile(&self) -> MemoryProfile {
-        let all = memory_profile(SHARED_PARAM_COUNT);
+        let all = self.model.memory_profile(4e-8);
         let of_rows = if self.rows.is_some() { size_of::<u32>() as u64 } else { 0 };
         MemoryProfile { per_gaussian: all.per_gaussian + of_rows, ..all }
-    }
-
-    fn notes(&self) -> Vec<String> {
-        self.defects.notes().into_iter().chain(self.file.note()).collect()
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        TimeOrigin::Continuous
-    }
-
-    fn time_convention(&self) -> TimeConvention {
-        TimeConvention::Given
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         self.model = self.model.with_times(times)?;
         Ok(self)
-    }
-
-    fn background(&self) -> Option<[f32; 3]> {
-        Some([0.0; 3])
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        OutputKind::Splatv
     }
 
     fn keeps_motion(&self, kind: OutputKind) -> bool {
@@ -224,7 +208,7 @@ impl InputModel for SplatvModel {
                 "a .splatv has less precision than a trained model and cannot be written as one\n  write a .splatv, a \
                  .gseq or --as ply-sequence",
             )),
-            _ => check_kind(kind, false),
+            _ => Ok(()),
         }
     }
 
@@ -235,7 +219,7 @@ impl InputModel for SplatvModel {
     }
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, compressed, (self.default_output_kind(), "model.splatv"), FileContent::from_name)
+        self.reopener.content(self, compressed, (OutputKind::Splatv, "model.splatv"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

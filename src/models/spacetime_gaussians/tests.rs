@@ -112,9 +112,9 @@ fn states_follow_the_formulas_in_both_variants() {
     for is_full in [false, true] {
         let root = folder(is_full);
         let model = open_with_frames(root.path());
-        assert_eq!(model.kind().contains("full"), is_full);
+        assert_eq!(model.description().kind.contains("full"), is_full);
         assert_eq!(
-            (model.source().info().count, model.time_convention(), model.background()),
+            (model.source().info().count, model.description().time_convention, model.description().background),
             (COUNT, TimeConvention::Given, Some([0.0; 3]))
         );
         for (state, time) in states(model.source()).iter().zip(TIMES) {
@@ -226,7 +226,10 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
         model.write(&compressed, OutputKind::Ply, &alone, &Limits::NONE, &Events::IGNORED).unwrap();
         assert_eq!(fs::read(&alone).unwrap(), fs::read(iteration.join(POINT_CLOUD_FILE)).unwrap());
         let alone = open_with_frames(&alone);
-        assert_eq!((alone.default_output_kind(), alone.kind()), (OutputKind::Ply, model.kind()));
+        assert_eq!(
+            (alone.description().default_output_kind, alone.description().kind),
+            (OutputKind::Ply, model.description().kind)
+        );
         assert_eq!(alone.check_output(OutputKind::Splatv, Path::new("x.splatv")).is_err(), is_full);
         assert!(alone.check_output(OutputKind::Model, Path::new("x")).is_err());
         // Its PLY holds the motion, so no note says that it is missing.
@@ -332,7 +335,7 @@ fn splatv_of_a_lite_model_keeps_motion_and_stored_words() {
     model.write(&all, OutputKind::Splatv, &path, &Limits::NONE, &Events::IGNORED).unwrap();
     let read = open_with_frames(&path);
     assert_eq!(
-        (read.kind(), read.source().info().count, read.default_output_kind()),
+        (read.description().kind, read.source().info().count, read.description().default_output_kind),
         ("splaTV model", COUNT, OutputKind::Splatv)
     );
     // Colors and opacities are stored as bytes, and colors outside 0 … 1 are clamped, so they are not compared.
@@ -410,7 +413,7 @@ fn wrong_properties_and_values_are_named() {
     // Without a model folder, nothing names the last function of the network, and the model opens with a note. A model
     // without Gaussians opens too.
     fs::write(&path, ply(&properties(true), 3, value)).unwrap();
-    assert!(open(&path).unwrap().notes().iter().any(|note| note.contains("sandwich")));
+    assert!(open(&path).unwrap().description().notes.iter().any(|note| note.contains("sandwich")));
     fs::write(&path, ply(&properties(false), 0, value)).unwrap();
     assert_eq!(open_with_frames(&path).source().info().count, 0);
 }

@@ -1,7 +1,5 @@
 //! Motion model of files in which each Gaussian is visible in one frame only and does not move.
 
-use xxhash_rust::xxh3::Xxh3;
-
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::ftgs::ClipTimes;
@@ -92,8 +90,6 @@ impl ProxyRule for FrameByFrame {
         let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
         Ok(model.raw().pick(&leaders))
     }
-
-    fn hash_settings(&self, _: &mut Xxh3) {}
 
     fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
         let timeline = Timeline::Frames(self.times.len());

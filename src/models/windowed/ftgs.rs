@@ -1,15 +1,14 @@
 //! `.ftgs.ply` files as a model format.
 
-use std::io::Read;
-use std::path::Path;
-
 use super::WindowedModel;
+use crate::files::cameras::TimeConvention;
 use crate::files::ftgs::{FtgsFile, MARKER_COMMENT};
-use crate::files::open::open_file;
+use crate::files::ply::header_contains;
 use crate::models::archive::reopen::Reopener;
 use crate::models::free_time_gs::frame_state::FreeTime;
-use crate::models::input_model::{ModelFormat, TimeOrigin};
+use crate::models::input_model::{ModelDescription, TimeOrigin};
 use crate::models::motion_model::MotionModelFrames;
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::kind::OutputKind;
 
 /// Minimum standard deviation of a time window, as a fraction of the length of the clip. Smaller ones are raised to it,
@@ -17,8 +16,10 @@ use crate::outputs::kind::OutputKind;
 pub(super) const SMALLEST_DEVIATION: f64 = 1e-9;
 
 /// Model format of `.ftgs.ply` files of ftgs-player, with linear motion in time windows: recognizes and opens a file.
-pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
-    recognizes: |found| found.is_file_of(b"ply", "ply") && has_marker(found.path),
+pub(in crate::models) const FTGS: InputFormat = InputFormat {
+    recognizes: |found| {
+        found.is_file_of(b"ply", "ply") && header_contains(found.path, &format!("comment {MARKER_COMMENT} "))
+    },
     open: |path, options| {
         options.refuse_for(path)?;
         let file = FtgsFile::open(path, &options.ply(), options.conventions.zero_rotation.unwrap_or_default())?;
@@ -28,24 +29,18 @@ pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
             min_opacity: file.header.opacity_floor,
         };
         let sh_degree = file.params.gaussians.sh_degree();
-        Ok(Box::new(WindowedModel {
+        Ok(Opened::from_model(WindowedModel {
             path: path.to_owned(),
-            name: "ftgs-player model",
-            default_output: OutputKind::Ftgs,
-            timing: TimeOrigin::Continuous,
-            notes: file.defects.notes(),
+            description: ModelDescription {
+                kind: "ftgs-player model",
+                notes: file.defects.notes(),
+                timing: TimeOrigin::Continuous,
+                time_convention: TimeConvention::Given,
+                default_output_kind: OutputKind::Ftgs,
+                ..ModelDescription::default()
+            },
             model: MotionModelFrames::new(motion, file.params, sh_degree),
             reopener: Some(Reopener::new(FTGS.open, options)),
         }))
     },
 };
-
-/// Returns whether the header of the PLY file at `path` has the comment that marks this format.
-fn has_marker(path: &Path) -> bool {
-    // The marker is at the start of the header; the rest of the file is not read.
-    let mut head = Vec::new();
-    let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
-    let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
-    let marker = format!("comment {MARKER_COMMENT} ");
-    read && header.windows(marker.len()).any(|bytes| bytes == marker.as_bytes())
-}

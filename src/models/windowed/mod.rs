@@ -11,19 +11,15 @@ use std::path::{Path, PathBuf};
 
 use super::archive::pack::FileContent;
 use super::archive::reopen::Reopener;
-use super::in_checkpoint::{ProxyRule, write_frames};
+use super::in_checkpoint::{ProxyRule, with_times, write_frames};
 use super::motion_model::{MotionModelFrames, propose_proxies};
-use super::size::{ModelSize, bytes_below, bytes_read_for};
-use super::trajectories::state_bytes;
+use super::size::{ModelSize, NO_FILES, bytes_below};
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
-use crate::files::cameras::TimeConvention;
 use crate::files::digest::digest_of_files;
 use crate::limits::Limits;
-use crate::model::{Attributes, Jacobian};
-use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
-use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
@@ -35,14 +31,7 @@ pub(super) use tsog::TSOG;
 #[derive(Debug)]
 struct WindowedModel<L: ProxyRule> {
     path: PathBuf,
-    /// Name of the format, shown to users.
-    name: &'static str,
-    /// Output kind with the same format as this file.
-    default_output: OutputKind,
-    /// Origin of the frame times: the caller may choose any times, or the file gives the number or the times of frames.
-    timing: TimeOrigin,
-    /// Notes for the user: repairs and guesses made while the file was opened.
-    notes: Vec<String>,
+    description: ModelDescription,
     model: MotionModelFrames<L>,
     /// Function and options to open the `.ftgs.ply` that an archive of this file holds. `None` for Gaussians without
     /// windows of time: a `.ftgs.ply` cannot hold them, so archives of this file hold frames instead.
@@ -58,8 +47,8 @@ impl<L: ProxyRule> WindowedModel<L> {
 }
 
 impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
-    fn kind(&self) -> &'static str {
-        self.name
+    fn description(&self) -> ModelDescription {
+        self.description.clone()
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -70,66 +59,24 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         digest_of_files([&*self.path])
     }
 
-    fn bytes(&self) -> Result<u64> {
-        bytes_read_for([&*self.path])
-    }
-
     fn size(&self) -> Result<ModelSize> {
-        Ok(ModelSize { cloud: self.bytes()?, ..ModelSize::default() })
+        ModelSize::from_cloud_file(&self.path, NO_FILES)
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
-        match kind == self.default_output {
-            true => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
+        match kind == self.description.default_output_kind {
+            true => ModelSize::from_cloud_file(path, NO_FILES),
             false => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
     fn memory_profile(&self) -> MemoryProfile {
-        let raw = self.model.raw();
-        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.format_specific.width() as u64;
-        MemoryProfile {
-            per_gaussian: whole,
-            // A copy of the parameters, without the Gaussians that were left out.
-            opening: whole,
-            // A copy of the stored parameters and the values prepared from them.
-            reader: whole + 16 + 8,
-            compressed: 2 * whole,
-            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
-            file: whole + 24,
-            gaussian_block: GAUSSIAN_BLOCK as u64,
-            seconds_per_state: 3e-8,
-            ..MemoryProfile::default()
-        }
-    }
-
-    fn notes(&self) -> Vec<String> {
-        self.notes.clone()
-    }
-
-    fn timing(&self) -> TimeOrigin {
-        self.timing
-    }
-
-    fn time_convention(&self) -> TimeConvention {
-        TimeConvention::Given
+        self.model.memory_profile(3e-8)
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        let found = self.model.info().times.len();
-        if self.timing == TimeOrigin::Numbered && times.len() != found {
-            return Err(Error::usage(format!("{} times were given for {found} frames", times.len())));
-        }
-        self.model = match self.model.motion_model().for_times(&times) {
-            Some(motion) => MotionModelFrames::new(motion, self.model.raw().clone(), self.model.info().sh_degree),
-            None => self.model,
-        };
-        self.model = self.model.with_times(times)?;
+        self.model = with_times(self.model, times, self.description.timing)?;
         Ok(self)
-    }
-
-    fn default_output_kind(&self) -> OutputKind {
-        self.default_output
     }
 
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
@@ -144,10 +91,6 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
 
     fn compute_proxies(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
-    }
-
-    fn archives_as_frames(&self) -> bool {
-        self.reopener.is_none()
     }
 
     fn archive_content(&self, compressed: &CompressedModel) -> Result<ArchiveContent> {

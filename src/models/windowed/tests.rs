@@ -12,10 +12,12 @@ use crate::files::tsog::read::read_tsog;
 use crate::files::tsog::write::write_tsog;
 use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::limits::ReadLimit;
+use crate::model::Attributes;
 use crate::model::{AttributeValues, Gaussians, StoredParams, opacity};
 use crate::models;
 use crate::models::OpenOptions;
 use crate::models::archive::checks::check_round_trip;
+use crate::models::input_model::TimeOrigin;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
 
@@ -69,7 +71,10 @@ fn ftgs_states_follow_the_formulas_of_the_player() {
         write_ftgs(&stored, &ClipTimes { first, last, ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
         let times = TIMES.map(|time| first + (last - first) * time);
         let model = open_at(&path, &times);
-        assert_eq!((model.kind(), model.default_output_kind()), ("ftgs-player model", OutputKind::Ftgs));
+        assert_eq!(
+            (model.description().kind, model.description().default_output_kind),
+            ("ftgs-player model", OutputKind::Ftgs)
+        );
         for (state, time) in states(&*model).iter().zip(TIMES) {
             for i in 0..COUNT {
                 let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);
@@ -172,7 +177,7 @@ fn tsog_states_follow_the_formulas_of_the_player() {
     write_tsog(&timed(Timeline::Windows), &path).unwrap();
     let stored = read_tsog(&path, ReadLimit::NONE).unwrap().params;
     let model = open_at(&path, &TIMES);
-    assert_eq!((model.kind(), model.default_output_kind()), ("TSOG model", OutputKind::Tsog));
+    assert_eq!((model.description().kind, model.description().default_output_kind), ("TSOG model", OutputKind::Tsog));
     for (state, time) in states(&*model).iter().zip(TIMES) {
         for i in 0..COUNT {
             let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);
@@ -193,7 +198,7 @@ fn a_tsog_of_single_frames_shows_each_gaussian_once() {
     write_tsog(&timed(Timeline::Frames(5)), &path).unwrap();
     let stored = read_tsog(&path, ReadLimit::NONE).unwrap().params;
     let model = models::open(&path, &OpenOptions::default()).unwrap().into_linked().unwrap();
-    assert_eq!((model.timing(), model.source().info().times.len()), (TimeOrigin::Numbered, 5));
+    assert_eq!((model.description().timing, model.source().info().times.len()), (TimeOrigin::Numbered, 5));
     for (frame, state) in states(&*model).iter().enumerate() {
         for i in 0..COUNT {
             let is_seen = stored.format_specific.plane(0)[i] as usize == frame;
@@ -224,13 +229,16 @@ fn archives_hold_windows_as_ftgs_and_single_frames_as_frames() {
     write_tsog(&timed(Timeline::Windows), &tsog).unwrap();
     for path in [&ftgs, &tsog] {
         let model = open_at(path, &TIMES);
-        assert!(!model.archives_as_frames());
+        assert!(!model.description().archives_as_frames);
         let kind = check_round_trip(&*model, &pruned(vec![2, 3, 9]), &OpenOptions::default(), 1e-3);
         assert_eq!(kind, OutputKind::Ftgs);
     }
     for timeline in [Timeline::Frames(4), Timeline::Still] {
         write_tsog(&timed(timeline), &tsog).unwrap();
         let model = models::open(&tsog, &OpenOptions::default()).unwrap().into_linked().unwrap();
-        assert!(model.archives_as_frames() && model.check_output(OutputKind::Archive, Path::new("a.gsz")).is_ok());
+        assert!(
+            model.description().archives_as_frames
+                && model.check_output(OutputKind::Archive, Path::new("a.gsz")).is_ok()
+        );
     }
 }

@@ -6,19 +6,21 @@ use super::WindowedModel;
 use super::frame_by_frame::FrameByFrame;
 use super::ftgs::{FTGS, SMALLEST_DEVIATION};
 use crate::error::Result;
+use crate::files::cameras::TimeConvention;
 use crate::files::tsog::read::{is_tsog, read_tsog};
 use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::models::archive::reopen::Reopener;
 use crate::models::free_time_gs::frame_state::FreeTime;
 use crate::models::in_checkpoint::ProxyRule;
 use crate::models::in_checkpoint::still::Still;
-use crate::models::input_model::{InputModel, ModelFormat, TimeOrigin};
+use crate::models::input_model::{ModelDescription, TimeOrigin};
 use crate::models::motion_model::MotionModelFrames;
+use crate::models::opened::{InputFormat, Opened};
 use crate::outputs::kind::OutputKind;
 
 /// Model format of `.tsog` files of web players: recognizes and opens a file with linear motion in time windows, with
 /// single frames, or with a model without motion.
-pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
+pub(in crate::models) const TSOG: InputFormat = InputFormat {
     recognizes: |found| !found.is_folder && is_named_or_zip(found.path, &found.head),
     open: |path, options| {
         options.refuse_for(path)?;
@@ -65,7 +67,15 @@ fn opened<L: ProxyRule + 'static>(
     model: MotionModelFrames<L>,
     reopener: Option<Reopener>,
     notes: Vec<String>,
-) -> Result<Box<dyn InputModel>> {
-    let (path, default_output) = (path.to_owned(), OutputKind::Tsog);
-    Ok(Box::new(WindowedModel { path, name: "TSOG model", default_output, timing, notes, model, reopener }))
+) -> Result<Opened> {
+    let description = ModelDescription {
+        kind: "TSOG model",
+        notes,
+        timing,
+        time_convention: TimeConvention::Given,
+        default_output_kind: OutputKind::Tsog,
+        archives_as_frames: reopener.is_none(),
+        ..ModelDescription::default()
+    };
+    Ok(Opened::from_model(WindowedModel { path: path.to_owned(), description, model, reopener }))
 }

@@ -184,7 +184,7 @@ impl ArchiveStage {
         let refine = self.refine.as_ref().map(RefineStage::key);
         let key = scene.work.key(&(self.psnr, archive_target, compressed, refine, fixed));
         let (archived, AsToml(summary)) = journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
-            let (archived, summary) = match scene.input.archives_as_frames() {
+            let (archived, summary) = match scene.input.description().archives_as_frames {
                 true => {
                     let left = scene.input.compressed_frames(compressed)?;
                     let (bounds, summary) = bounds::find(scene, &*left, self.psnr, archive_target)?;
@@ -266,7 +266,7 @@ impl ArchiveStage {
 /// # Errors
 /// Fails if the input cannot be archived or values are not finite.
 pub fn estimated_bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
-    if scene.input.archives_as_frames() {
+    if scene.input.description().archives_as_frames {
         return bounds::bytes(scene, &*scene.input.compressed_frames(compressed)?);
     }
     let content = scene.input.archive_content(compressed)?;

@@ -46,7 +46,7 @@ pub(crate) fn highest(scene: &Scene, rule: ShDegreeRule, output: Option<OutputKi
     if degree >= all {
         return all;
     }
-    if let Some(why) = scene.input.reason_to_keep_sh_degree() {
+    if let Some(why) = scene.input.description().reason_to_keep_sh_degree {
         if requested < all {
             journal.leave_out(DROPPED_DEGREES, why);
         }
@@ -150,7 +150,7 @@ impl ShDegreeStage {
     ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
         let views = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
-        let stay = match scene.input.reason_to_keep_sh_degree() {
+        let stay = match scene.input.description().reason_to_keep_sh_degree {
             _ if all == 0 => Some("colors have SH degree 0"),
             None if compressed.is_empty() || views.is_empty() => Some("there are no Gaussians or no views to compare"),
             why => why,

@@ -236,8 +236,4 @@ impl BlockReader for RoundedReader<'_> {
     fn expect(&mut self, plan: &ReadPlan) {
         self.reader.expect(plan);
     }
-
-    fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {
-        self.reader.prepare(frame, want)
-    }
 }

@@ -163,7 +163,7 @@ impl ByteLimit {
         journal: &mut Journal,
     ) -> Result<Vec<ByteLimitFit>> {
         let highest = template.sh_degree.min(scene.source().info().sh_degree);
-        let lowest = if drops && scene.input.reason_to_keep_sh_degree().is_none() { 0 } else { highest };
+        let lowest = if drops && scene.input.description().reason_to_keep_sh_degree.is_none() { 0 } else { highest };
         let mut fits: Vec<ByteLimitFit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
             if fits.last().is_some_and(|fit| fit.gaussians == ranking.order().len()) {

@@ -147,11 +147,6 @@ pub fn prefetch_pages(_map: &Mmap, _range: Range<usize>) {}
 /// `map` must be backed by a file and not by anonymous memory, as on the other systems.
 pub unsafe fn release_pages(_map: &Mmap, _range: Range<usize>) {}
 
-/// Returns `None`, because Windows does not tell whether reading the byte at `offset` needs disk access.
-pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
-    None
-}
-
 /// Does nothing: on Windows a mapped file cannot be truncated.
 pub fn report_truncated_maps(_message: TruncatedMapMessage) {}
 

@@ -19,7 +19,7 @@ use crate::source::{
 };
 use rayon::prelude::*;
 
-use super::cfg_args::ModelConfig;
+use super::config::ModelConfig;
 use super::small_field::rounded;
 use crate::files::digest::digest_of_files;
 use crate::files::ply::{Ply, PlyOptions};

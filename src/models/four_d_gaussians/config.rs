@@ -1,22 +1,11 @@
-//! File `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`. The text is parsed and never
-//! evaluated.
+//! Hyperparameters of a 4DGaussians model, from its file `cfg_args`.
 
 use std::path::Path;
 
 use crate::deform::{FieldConfig, Tensors};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::model::Attributes;
-
-use crate::files::names::last_component;
-use crate::files::open::read_small;
-use crate::files::python_literal::{Literal, parse_call};
-
-/// Maximum bytes of a `cfg_args` file, more than any namespace that an argument parser prints.
-const MAX_BYTES: u64 = 1 << 20;
-/// Name of the Python call that a `cfg_args` file consists of.
-pub(in crate::models) const CALL_NAME: &str = "Namespace";
-/// Key of the SH degree in `cfg_args`.
-const SH_DEGREE: &str = "sh_degree";
+use crate::models::cfg_args::{self, Arguments, SH_DEGREE};
 
 /// Hyperparameters of a 4DGaussians model. Keys that `cfg_args` lacks have the defaults of the original code.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,23 +62,17 @@ impl ModelConfig {
     /// # Errors
     /// Fails if the file cannot be read, is no `Namespace(...)`, or a known key has a value of the wrong type.
     pub fn read(path: &Path) -> Result<Self> {
-        Self::parse(&read(path)?, path)
+        Self::parse(&cfg_args::read(path)?, path)
     }
 
     /// Parses the text of a `cfg_args` file; `path` is for error messages.
     ///
     /// Unknown keys may hold any text whose brackets and quotes are balanced.
     pub fn parse(text: &str, path: &Path) -> Result<Self> {
-        let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
-        let get = |name: &'static str| {
-            // Python would refuse a repeated keyword. In a hand-edited file the last one counts.
-            keys.iter().rev().find(|key| key.name == name).map_or(
-                ConfigKey { name, value: &Literal::None, path },
-                |found| ConfigKey { name, value: &found.value, path },
-            )
-        };
+        let arguments = Arguments::parse(text, path)?;
+        let get = |name: &'static str| arguments.get(name);
         let planes = get("kplanes_config");
-        let config = ModelConfig {
+        Ok(ModelConfig {
             sh_degree: get(SH_DEGREE).int(3)?,
             source_path: get("source_path").string()?,
             white_background: get("white_background").bool(false)?,
@@ -109,8 +92,7 @@ impl ModelConfig {
             empty_voxel: get("empty_voxel").bool(false)?,
             grid_pe: get("grid_pe").int(0)?,
             apply_rotation: get("apply_rotation").bool(false)?,
-        };
-        Ok(config)
+        })
     }
 
     /// Returns a note for each hyperparameter that contradicts the shapes of the weights `tensors`, which take
@@ -178,170 +160,10 @@ impl ModelConfig {
     }
 }
 
-/// Returns the text of the `cfg_args` file at `path`. Fails if the file cannot be read, is not UTF-8 text or has more
-/// than [`MAX_BYTES`] bytes.
-pub(in crate::models) fn read(path: &Path) -> Result<String> {
-    let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
-    String::from_utf8(bytes).map_err(|error| {
-        let valid = error.utf8_error().valid_up_to();
-        Error::input(path, format!("byte {valid}"), "UTF-8 text", "an invalid byte")
-    })
-}
-
-/// Returns `text`, the content of a `cfg_args` file, with the SH degree `degree` and all other bytes unchanged. If
-/// `text` does not give the SH degree, it becomes the first key. `path` is for error messages. Fails if `text` is not a
-/// `Namespace(…)`.
-pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
-    let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
-    let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
-        Some(key) => (key.place.clone(), degree.to_string()),
-        None => {
-            let start = text.find('(').map_or(text.len(), |bracket| bracket + 1);
-            let separator = if keys.is_empty() { "" } else { ", " };
-            (start..start, format!("{SH_DEGREE}={degree}{separator}"))
-        }
-    };
-    Ok([&text[..place.start], &value, &text[place.end..]].concat())
-}
-
-/// Returns the text of the `cfg_args` file at `path` for an output with SH degree `degree`. `input_degree` is the SH
-/// degree of the input. If `degree` is lower than `input_degree`, `degree` replaces the SH degree in the text;
-/// otherwise the text is unchanged. Fails if the file cannot be read.
-pub(in crate::models) fn read_for_degree(path: &Path, input_degree: usize, degree: usize) -> Result<String> {
-    let text = read(path)?;
-    if degree < input_degree { with_sh_degree(&text, degree, path) } else { Ok(text) }
-}
-
-/// Returns `text`, the content of the `cfg_args` file at `path`, without the folders of the training machine, because
-/// archives are made to be shared. The strings of `source_path` and `model_path`, and all strings that are absolute
-/// paths, are replaced by their last path components; all other bytes are unchanged. Fails if `text` is not a
-/// `Namespace(…)`.
-pub(in crate::models) fn without_folder_paths(text: &str, path: &Path) -> Result<String> {
-    let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
-    let (mut out, mut end) = (String::with_capacity(text.len()), 0);
-    for key in &keys {
-        out += &text[end..key.place.start];
-        out += &without_paths(&text[key.place.clone()], ["source_path", "model_path"].contains(&key.name.as_str()));
-        end = key.place.end;
-    }
-    Ok(out + &text[end..])
-}
-
-/// Returns the Python expression `expression` with strings replaced by their last path components: all strings if
-/// `all`, else only absolute paths.
-fn without_paths(expression: &str, all: bool) -> String {
-    let mut out = String::with_capacity(expression.len());
-    let mut rest = expression;
-    while let Some(start) = rest.find(['\'', '"']) {
-        let quote = rest[start..].chars().next().unwrap_or('"');
-        let content = &rest[start + 1..];
-        let mut is_escaped = false;
-        let end = content.find(|c: char| {
-            let ends = c == quote && !is_escaped;
-            is_escaped = c == '\\' && !is_escaped;
-            ends
-        });
-        // A quote without a closing quote does not begin a string.
-        let Some(end) = end else { break };
-        let string = &content[..end];
-        let is_absolute = string.starts_with(['/', '~', '\\']) || string.get(1..2) == Some(":");
-        let last = last_component(string);
-        out += &rest[..=start];
-        match all || is_absolute {
-            true => out.extend(last.chars().filter(|&c| c != quote)),
-            false => out += string,
-        }
-        out.push(quote);
-        rest = &content[end + 1..];
-    }
-    out + rest
-}
-
-/// Key of a `cfg_args` file with its value. A missing key has the value `None`, which selects the default.
-#[derive(Clone, Copy)]
-pub(in crate::models) struct ConfigKey<'a> {
-    pub(in crate::models) name: &'static str,
-    pub(in crate::models) value: &'a Literal,
-    pub(in crate::models) path: &'a Path,
-}
-
-impl<'a> ConfigKey<'a> {
-    /// Returns an error which says that the value of this key is wrong; `expected` describes a correct value.
-    pub(in crate::models) fn wrong(&self, expected: &str) -> Error {
-        Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
-    }
-
-    /// Returns the value as a boolean, or `default` if the key is missing; 0 and 1 count as booleans. Fails for any
-    /// other value.
-    pub(in crate::models) fn bool(&self, default: bool) -> Result<bool> {
-        match self.value {
-            Literal::None => Ok(default),
-            Literal::Bool(value) => Ok(*value),
-            Literal::Int(value @ (0 | 1)) => Ok(*value == 1),
-            _ => Err(self.wrong("True or False")),
-        }
-    }
-
-    /// Returns the value as an integer, or `default` if the key is missing. Accepts booleans: Python's `True` is the
-    /// integer 1, and some forks write `grid_pe=False`. Fails for any other value.
-    pub(in crate::models) fn int(&self, default: i64) -> Result<i64> {
-        match self.value {
-            Literal::None => Ok(default),
-            Literal::Int(value) => Ok(*value),
-            Literal::Bool(value) => Ok(i64::from(*value)),
-            _ => Err(self.wrong("an integer")),
-        }
-    }
-
-    /// Returns the value as a number, or `default` if the key is missing. Fails if the value is not a number.
-    pub(in crate::models) fn float(&self, default: f64) -> Result<f64> {
-        match self.value {
-            Literal::None => Ok(default),
-            Literal::Float(value) => Ok(*value),
-            Literal::Int(value) => Ok(*value as f64),
-            _ => Err(self.wrong("a number")),
-        }
-    }
-
-    /// Returns the value as a string; `None` if the key is missing. Fails if the value is not a string.
-    pub(in crate::models) fn string(&self) -> Result<Option<String>> {
-        match self.value {
-            Literal::None => Ok(None),
-            Literal::Str(value) => Ok(Some(value.clone())),
-            _ => Err(self.wrong("a string")),
-        }
-    }
-
-    /// Returns the value as a list of integers, or `default` if the key is missing. Fails if the value is not such a
-    /// list.
-    fn ints(&self, default: &[i64]) -> Result<Vec<i64>> {
-        match self.value {
-            Literal::None => Ok(default.to_vec()),
-            Literal::Sequence(items) => {
-                items.iter().map(|value| ConfigKey { value, ..*self }.int(0)).collect::<Result<_>>()
-            }
-            _ => Err(self.wrong("a list of integers")),
-        }
-    }
-
-    /// Returns the entry `name` of this key's value, which must be a dictionary. The returned entry has no value if the
-    /// key or the entry is missing. Fails if the value is not a dictionary.
-    fn entry(&self, name: &'static str) -> Result<ConfigKey<'a>> {
-        let value = match self.value {
-            Literal::None => &Literal::None,
-            Literal::Dict(entries) => entries
-                .iter()
-                .find(|(key, _)| matches!(key, Literal::Str(key) if key == name))
-                .map_or(&Literal::None, |(_, value)| value),
-            _ => return Err(self.wrong("a dictionary")),
-        };
-        Ok(ConfigKey { name, value, path: self.path })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::models::cfg_args::{with_sh_degree, without_folder_paths};
 
     #[test]
     fn archives_keep_no_folder_of_the_training_machine() {
