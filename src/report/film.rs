@@ -79,19 +79,19 @@ pub fn memory_bytes(work: &Workload) -> u64 {
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
-pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
-    let every = side.scene.source().info().times.len();
+pub fn render_films(pair: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
+    let every = pair.scene.source().info().times.len();
     let mut films: Vec<FilmPanel> = Vec::new();
     let mut cameras = Vec::new();
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
-        let FrameView { view, camera, .. } = side.view(choice.place);
+        let FrameView { view, camera, .. } = pair.view(choice.place);
         let wanted = k == 0 || choice.why.iter().any(|why| why == MEDIAN);
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == MAX_VIEWS {
             continue;
         }
         cameras.push(camera);
         let views = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), MAX_FRAMES);
-        let made = side.render_pairs(&views, |[original, compressed]| {
+        let made = pair.render_pairs(&views, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
             let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));
             let images =
@@ -99,7 +99,7 @@ pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
             Ok((psnr(compressed, original), shrinkage(original, MAX_PIXELS), images))
         })?;
         let shrunk = made.first().map_or(1, |made| made.1);
-        let of = &side.scene.rig.cameras[camera as usize];
+        let of = &pair.scene.rig.cameras[camera as usize];
         films.push(FilmPanel {
             why: choice.why.clone(),
             view,

@@ -4,13 +4,14 @@
 //! Input: a [`PrecisionDiagram`]. Output: charts as SVG, and a page with charts.
 
 use super::chart::{ChartAxis, Plot, Series};
-use super::document::{document, figure_of, links, list};
-use super::html::{count, escape, figure, file_name};
+use super::document::{figure_of, list, measurements_page};
+use super::html::{escape, figure};
 use super::trade_off::Chart;
 use crate::evaluation::precision::{
     ADDED_ERROR, KEPT_COUNT_ERROR, KEPT_SET_JACCARD_DISTANCE, PrecisionCurve, PrecisionDiagram, PrecisionKnob,
     PrecisionSetting, RENDER_ERROR, axis_label,
 };
+use crate::progress::grouped;
 
 /// File name of the page that the command `precision` writes.
 pub const PAGE_FILE: &str = "precision.html";
@@ -27,12 +28,7 @@ const WORK: [WorkMeasure; 3] = [
 
 /// Returns the HTML of the page that the command `precision` writes.
 pub fn page(diagram: &PrecisionDiagram) -> String {
-    let title = format!("{} – error against run time", file_name(&diagram.path));
-    let mut body = format!(
-        "<header>\n<h1>Error against run time: {}</h1>\n</header>\n{}",
-        escape(file_name(&diagram.path)),
-        conditions(diagram)
-    );
+    let mut body = conditions(diagram);
     for knob in &diagram.knobs {
         body += &format!(
             "<section>\n<h2>{} <small>({} error)</small></h2>\n{}</section>\n",
@@ -41,12 +37,8 @@ pub fn page(diagram: &PrecisionDiagram) -> String {
             knob_html(knob)
         );
     }
-    body += &format!(
-        "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
-        links(&["precision.json", "precision.csv"]),
-        escape(&diagram.tool)
-    );
-    document(&title, &body, &[])
+    let files = ["precision.json", "precision.csv"];
+    measurements_page("Error against run time", &diagram.path, &body, &files, &diagram.tool)
 }
 
 /// Returns the work-precision diagrams as an HTML section of a report.
@@ -62,13 +54,13 @@ fn conditions(diagram: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \
          keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
-        count(diagram.gaussians),
-        count(diagram.frames),
-        count(diagram.views_scored),
-        count(diagram.frames_scored),
+        grouped(diagram.gaussians),
+        grouped(diagram.frames),
+        grouped(diagram.views_scored),
+        grouped(diagram.frames_scored),
         diagram.judged,
         escape(&diagram.cameras),
-        count(diagram.kept),
+        grouped(diagram.kept),
         diagram.threads,
         diagram.runs,
         diagram.max_setting_seconds,

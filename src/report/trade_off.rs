@@ -4,11 +4,12 @@
 //! Input: a [`TradeOff`]. Output: charts as SVG, whose colors come from [`super::chart::STYLE`], and pages with charts.
 
 use super::chart::{ChartAxis, Plot, Series};
-use super::document::{document, figure_of, links, list};
-use super::html::{bytes, count, escape, figure, file_name};
+use super::document::{figure_of, list, measurements_page};
+use super::html::{escape, figure};
 use crate::evaluation::method::Method;
 use crate::evaluation::trade_off::{EffortCurve, TradeOff, TradeOffPoint};
 use crate::pipeline::summary::GoalSummary;
+use crate::progress::{decimal_bytes, grouped};
 
 /// File name of the page that the command `sweep` writes.
 pub const PAGE_FILE: &str = "sweep.html";
@@ -23,15 +24,8 @@ type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 pub fn page(trade_off: &TradeOff) -> String {
     let mut files = vec!["sweep.json", "sweep.csv"];
     files.extend((!trade_off.knobs.is_empty()).then_some("knobs.csv"));
-    let body = format!(
-        "<header>\n<h1>What quality costs: {}</h1>\n</header>\n<section>\n{}</section>\n\
-         <p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
-        escape(file_name(&trade_off.path)),
-        section(trade_off),
-        links(&files),
-        escape(&trade_off.tool)
-    );
-    document(&format!("{} – what quality costs", file_name(&trade_off.path)), &body, &[])
+    let body = format!("<section>\n{}</section>\n", section(trade_off));
+    measurements_page("What quality costs", &trade_off.path, &body, &files, &trade_off.tool)
 }
 
 /// Returns an HTML section with a description of the sweep, its charts and its notes.
@@ -44,8 +38,8 @@ pub(super) fn section(trade_off: &TradeOff) -> String {
         "<p class=\"note\">{}: {} Gaussians, {}; {} renders, {} threads{runs}. Lines go from few Gaussians to \
          many.{pair}</p>\n<div class=\"charts\">\n",
         escape(&trade_off.path),
-        count(trade_off.gaussians),
-        bytes(trade_off.bytes),
+        grouped(trade_off.gaussians),
+        decimal_bytes(trade_off.bytes),
         trade_off.views,
         trade_off.threads
     );
