@@ -240,13 +240,13 @@ pub(super) struct Render {
     #[arg(long, value_name = "FILE")]
     pub(super) video: Option<PathBuf>,
     /// Move the camera of --video through these views, such as 0,2,5 [default: all views of the split]
-    #[arg(long, requires = "video", value_name = "VIEWS", num_args = 0..=1, value_delimiter = ',', conflicts_with = "view")]
+    #[arg(long, value_name = "VIEWS", num_args = 0..=1, value_delimiter = ',', conflicts_with = "view")]
     pub(super) path: Option<Vec<u32>>,
     /// Frames per second of --video [default: 25]
-    #[arg(long, requires = "video", value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100))]
     pub(super) fps: Option<u32>,
     /// Model to show beside the input in --video, with the same frames
-    #[arg(long, requires = "video", value_name = "MODEL")]
+    #[arg(long, value_name = "MODEL")]
     pub(super) beside: Option<PathBuf>,
     /// Split of the views to render [default: with --all or --path: test, else val, else all; otherwise: all]
     #[arg(long, value_parser = choice(SPLITS))]

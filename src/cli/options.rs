@@ -131,8 +131,14 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
 /// Returns the library's options for `render` without `--video`.
 ///
 /// # Errors
-/// Fails if `--as` and the name of the output ask for different formats.
+/// Fails if an option that needs `--video` is given, or if `--as` and the name of the output ask for different formats.
 pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOptions> {
+    // The parser accepts these options without --video, because --output excludes it.
+    let video_flags =
+        [("--path", args.path.is_some()), ("--fps", args.fps.is_some()), ("--beside", args.beside.is_some())];
+    if let Some((flag, _)) = video_flags.into_iter().find(|(_, given)| *given) {
+        return Err(Error::usage(format!("{flag} needs --video FILE")));
+    }
     let format = args.format.unwrap_or(ImageFormat::Png);
     let (selection, views) = match args.frame.zip(args.view) {
         Some((frame, view)) => (RenderSelection::One { frame: frame as usize, view }, ViewSet::All),
