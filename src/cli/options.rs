@@ -362,7 +362,8 @@ fn memory_budget(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 
-/// Returns the split whose views Gaussians are scored by, from the option `--split`; `None` for the views of all splits.
+/// Returns the split whose views Gaussians are scored by, from the option `--split`; `None` for the views of all
+/// splits.
 pub(super) fn scored_split(split: Option<ViewSet>) -> Option<Split> {
     match split {
         None => Some(Split::Train),

@@ -148,9 +148,9 @@ impl Drop for Bar {
     }
 }
 
-/// Returns the line of a progress bar: name, bar, percentage, count, rate and time left. `total`: number of units of the
-/// task; `None` if unknown, 0 while the task is still being prepared. `left`: estimated seconds until the end of the
-/// task; shown from 1 second on.
+/// Returns the line of a progress bar: name, bar, percentage, count, rate and time left. `total`: number of units of
+/// the task; `None` if unknown, 0 while the task is still being prepared. `left`: estimated seconds until the end of
+/// the task; shown from 1 second on.
 fn bar_line(name: &str, done: u64, total: Option<u64>, unit: &str, per_second: f64, left: f64) -> String {
     let mut line = format!("{name:>10}");
     let total = total.filter(|&total| total > 0);

@@ -33,8 +33,8 @@ enum RecipeSetting {
 /// parameters.
 #[derive(Debug, Clone, Args)]
 pub(super) struct RecipeFlags {
-    /// Recipe to start from: `default`, the best known; `paper`, as published; `gentle`, removes less; `strong`, removes
-    /// more. `paper` and `gentle` do not refine
+    /// Recipe to start from: `default`, the best known; `paper`, as published; `gentle`, removes less; `strong`,
+    /// removes more. `paper` and `gentle` do not refine
     #[arg(long, help_heading = HEADING, value_parser = PRESETS.map(|(name, _)| name))]
     preset: Option<String>,
     /// TOML file with any of the parameters; others come from --preset. The recipe.toml beside a result repeats its run

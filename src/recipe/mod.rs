@@ -195,8 +195,8 @@ const RANGES: [(&str, &str, [f64; 2]); 27] = [
     ("field", "field_margin", FINITE),
 ];
 
-/// Checks that the value `value` of the parameter `name` is within the range from `min` to `max`; NaN is not. Fails with
-/// a message that states the range.
+/// Checks that the value `value` of the parameter `name` is within the range from `min` to `max`; NaN is not. Fails
+/// with a message that states the range.
 fn check_range(name: &str, value: f64, [min, max]: [f64; 2]) -> std::result::Result<(), String> {
     if (min..=max).contains(&value) {
         return Ok(());

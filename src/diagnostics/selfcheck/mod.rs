@@ -30,8 +30,8 @@ use crate::error::{Error, Result};
 pub use case::CaseResult;
 use case::LargestError;
 
-/// Case of the self-check. The fields are, in order: its name, what it compares, the bound of its error, and the function
-/// that adds the error of every compared value to its argument.
+/// Case of the self-check. The fields are, in order: its name, what it compares, the bound of its error, and the
+/// function that adds the error of every compared value to its argument.
 type Case = (&'static str, &'static str, f64, fn(&mut LargestError) -> Result<()>);
 
 /// List of the cases of the self-check, in the order of the pipeline. The documentation of each function gives the
