@@ -1,15 +1,13 @@
 //! Charts as SVG elements of a page.
 //!
-//! Input: numbers and names. Output: one `<svg>` element with colors from [`STYLE`] and the font of the page around it.
-//! Values that are not finite are not drawn. Series differ by shape and dash as well as by color. The colors are those
-//! of Okabe and Ito ("Color Universal Design", 2008), which color-blind people can tell apart.
+//! Input: numbers and names. Output: one `<svg>` element with colors from `chart.css` and the font of the page around
+//! it. Values that are not finite are not drawn. Series differ by shape and dash as well as by color. The colors are
+//! those of Okabe and Ito ("Color Universal Design", 2008), which color-blind people can tell apart.
 
 use std::fmt::{self, Write as _};
 
+use super::document::figure_of;
 use super::html::{escape, figure};
-
-/// Style sheet of charts, which a page must hold once.
-pub const STYLE: &str = include_str!("chart.css");
 
 /// Width of a chart in SVG units, which are about a pixel each.
 const WIDTH: f64 = 480.0;
@@ -25,7 +23,7 @@ const BOTTOM: f64 = 46.0;
 const LINE: f64 = 18.0;
 /// Approximate width of a letter in SVG units (about pixels), on a narrow page, where letters are largest.
 const LETTER: f64 = 8.2;
-/// Number of different styles of series (color, shape, dash) that [`STYLE`] defines.
+/// Number of different styles of series (color, shape, dash) that `chart.css` defines.
 const STYLE_COUNT: usize = 9;
 
 /// Axis of a chart, as the caller describes it.
@@ -35,8 +33,18 @@ pub struct ChartAxis {
     pub label: String,
     /// Whether the axis is logarithmic. Values that are not positive are then left out.
     pub log: bool,
-    /// Whether the axis must reach 0. Ignored if the axis is logarithmic.
-    pub from_zero: bool,
+}
+
+impl ChartAxis {
+    /// Returns a linear axis for the quantity `label`.
+    pub fn linear(label: &str) -> ChartAxis {
+        ChartAxis { label: label.to_owned(), log: false }
+    }
+
+    /// Returns a logarithmic axis for the quantity `label`.
+    pub fn log(label: &str) -> ChartAxis {
+        ChartAxis { label: label.to_owned(), log: true }
+    }
 }
 
 /// Series of points in a plot, drawn in one style.
@@ -51,14 +59,14 @@ pub struct Series {
     /// Whether the series is paired with the series before it. It then has the same color, dashed lines and hollow
     /// marks.
     pub paired: bool,
-    /// Texts beside the points, shown where there is room: one per point, or none at all.
+    /// Texts beside the points, shown where there is space: one per point, or none at all.
     pub labels: Vec<String>,
 }
 
 /// Plot of series over two axes.
 #[derive(Debug, Clone, Default)]
 pub struct Plot {
-    /// Description of the chart for readers who do not see it.
+    /// Caption of the chart.
     pub title: String,
     /// Horizontal axis.
     pub x: ChartAxis,
@@ -102,32 +110,22 @@ impl AxisScale {
         if low > high {
             return None;
         }
-        if axis.from_zero && !axis.log {
-            (low, high) = (low.min(0.0), high.max(0.0));
-        }
         if axis.log {
             (low, high) = (low.log10(), high.log10());
         }
         if high - low < 1e-12 * high.abs().max(1e-9) {
-            let room = if axis.log { 0.3 } else { 0.05 * high.abs().max(1e-9) };
-            (low, high) = (low - room, high + room);
+            let margin = if axis.log { 0.3 } else { 0.05 * high.abs().max(1e-9) };
+            (low, high) = (low - margin, high + margin);
         }
-        let room = 0.04 * (high - low);
-        let flat = axis.from_zero && !axis.log;
-        Some(AxisScale {
-            log: axis.log,
-            low: if flat && low == 0.0 { low } else { low - room },
-            high: if flat && high == 0.0 { high } else { high + room },
-            start,
-            end,
-        })
+        let margin = 0.04 * (high - low);
+        Some(AxisScale { log: axis.log, low: low - margin, high: high + margin, start, end })
     }
 
-    /// Extends the range of values of this axis at its upper end, so that about `room` SVG units (about pixels) stay
+    /// Extends the range of values of this axis at its upper end, so that about `margin` SVG units (about pixels) stay
     /// free after the largest value.
-    fn reserve_end(&mut self, room: f64) {
+    fn reserve_end(&mut self, margin: f64) {
         let length = self.end - self.start;
-        self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
+        self.high += (self.high - self.low) * margin / (length - margin).max(0.5 * length);
     }
 
     /// Returns the position at which `value` is drawn, in SVG units (about pixels); `None` if the value is not finite,
@@ -174,6 +172,11 @@ fn even_ticks(low: f64, high: f64) -> Vec<f64> {
 }
 
 impl Plot {
+    /// Returns the plot as an HTML figure, with its title as the caption.
+    pub fn figure(&self) -> String {
+        figure_of(&self.title, &self.svg())
+    }
+
     /// Returns the plot as an `<svg>` element.
     pub fn svg(&self) -> String {
         let styles = self.styles();
@@ -232,10 +235,11 @@ impl StackedHistogram {
         let bins = self.edges.len().saturating_sub(1);
         let count = |group: &(String, Vec<usize>), bin: usize| group.1.get(bin).copied().unwrap_or(0);
         let total = |bin| self.groups.iter().map(|group| count(group, bin)).sum::<usize>() as f64;
-        let up = ChartAxis { from_zero: true, ..ChartAxis::default() };
         let x = AxisScale::new(&self.x, self.edges.iter().copied(), [LEFT, WIDTH - RIGHT]);
-        let y = AxisScale::new(&up, (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
-        let (Some(x), Some(y)) = (x, y) else { return out.empty() };
+        let y = AxisScale::new(&ChartAxis::default(), (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
+        let (Some(x), Some(mut y)) = (x, y) else { return out.empty() };
+        // Bars stand on 0.
+        y.low = 0.0;
         out.axes(&x, &y, &self.x.label, "Gaussians");
         for bin in 0..bins {
             let (low, high) = (self.edges[bin], self.edges[bin + 1]);
@@ -263,10 +267,10 @@ impl StackedHistogram {
     }
 }
 
-/// Style of a series, which selects CSS classes of [`STYLE`].
+/// Style of a series, which selects CSS classes of `chart.css`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SeriesStyle {
-    /// Index of the style (color, shape, dash) in [`STYLE`]; less than [`STYLE_COUNT`].
+    /// Index of the style (color, shape, dash) in `chart.css`; less than [`STYLE_COUNT`].
     number: usize,
     hollow: bool,
 }
@@ -487,9 +491,7 @@ mod tests {
 
     #[test]
     fn higher_values_lie_higher_and_bins_stand_on_one_another() {
-        let axis = ChartAxis { from_zero: true, ..ChartAxis::default() };
-        let scale = AxisScale::new(&axis, [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
-        assert_eq!(scale.at(0.0), Some(200.0));
+        let scale = AxisScale::new(&ChartAxis::default(), [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
         assert!(scale.at(4.0) < scale.at(1.0));
         let groups = vec![("kept".to_owned(), vec![3, 0]), ("dropped".to_owned(), vec![1, 2])];
         let svg = StackedHistogram { edges: vec![0.0, 1.0, 2.0], groups, ..StackedHistogram::default() }.svg();

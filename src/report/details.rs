@@ -225,8 +225,8 @@ fn histogram(of: &Histogram) -> String {
     StackedHistogram {
         title: format!("{} of kept, dropped and merged Gaussians", of.meaning),
         x: match of.log {
-            true => ChartAxis { label: of.name.to_owned(), log: true, from_zero: false },
-            false => ChartAxis { label: format!("{}, part of the frames", of.name), ..ChartAxis::default() },
+            true => ChartAxis::log(of.name),
+            false => ChartAxis::linear(&format!("{}, part of the frames", of.name)),
         },
         edges: of.edges.clone(),
         groups: vec![

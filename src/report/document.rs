@@ -3,11 +3,13 @@
 //! All text from files or paths passes through [`escape`]. The content security policy in the head allows a browser to
 //! load only images that the file contains and to run only the scripts whose digests it lists.
 
-use super::chart;
 use super::html::{escape, file_name};
 use crate::files::page_policy::{policy_digest, policy_meta_element};
 
+/// Style sheet of pages.
 const STYLE: &str = include_str!("page.css");
+/// Style sheet of charts.
+const CHART_STYLE: &str = include_str!("chart.css");
 
 /// Returns a complete HTML file with the title `title` and the content `body`. The JavaScript texts `scripts` run at
 /// the end of the page; they must not contain text from files.
@@ -25,14 +27,14 @@ pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          {policy}\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <title>{}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<main>\n{body}{scripts}</main>\n</body>\n</html>\n",
+         <title>{}</title>\n<style>\n{STYLE}{CHART_STYLE}</style>\n</head>\n<body>\n<main>\n\
+         {body}{scripts}</main>\n</body>\n</html>\n",
         escape(title),
-        chart::STYLE,
     )
 }
 
-/// Returns the HTML page of the measurements of the model `path`. `heading` begins the title. `files`: names of the data
-/// files beside the page. `tool`: program that made it.
+/// Returns the HTML page of the measurements of the model `path`. `heading` begins the title. `files`: names of the
+/// data files beside the page. `tool`: program that made it.
 pub(super) fn measurements_page(heading: &str, path: &str, body: &str, files: &[&str], tool: &str) -> String {
     let title = format!("{heading}: {}", file_name(path));
     let body = format!(

@@ -19,8 +19,8 @@ pub(super) fn header(results: &[Analysis], names: &[String]) -> String {
     out += &table(results, names);
     out += &format!(
         "<p class=\"note\">Compared on {} renders of {} from {}: {}. PSNR has peak 1 and is averaged \
-         over renders; higher is better. From 40 dB on, two renders look alike. Render times are per view, on one thread \
-         of this machine.</p>\n",
+         over renders; higher is better. From 40 dB on, two renders look alike. Render times are per view, on one \
+         thread of this machine.</p>\n",
         grouped(found.cameras.pairs),
         counted(found.loss.per_frame.len(), "frame"),
         counted(found.cameras.cameras, "camera"),

@@ -3,7 +3,6 @@
 
 use super::analysis::Analysis;
 use super::chart::{ChartAxis, Plot, Series};
-use super::document::figure_of;
 use crate::evaluation::results::{Comparison, QualityMeans};
 
 /// Returns the HTML of the charts of PSNR by frame and by view; empty for a single view of a single frame.
@@ -75,6 +74,6 @@ fn chart(
     if series.iter().all(|series| series.points.len() < 2) {
         return String::new();
     }
-    let [x, y] = labels.map(|label| ChartAxis { label: label.to_owned(), ..ChartAxis::default() });
-    figure_of(title, &Plot { title: title.to_owned(), x, y, series }.svg())
+    let [x, y] = labels.map(ChartAxis::linear);
+    Plot { title: title.to_owned(), x, y, series }.figure()
 }
