@@ -5,14 +5,10 @@
 //! animations of at most [`MAX_FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their
 //! difference: about 3 MB per result.
 
-use std::io;
-
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
-use super::shown_images::{MEDIAN, ShownImage, brighter, difference, shrink, shrinkage};
-use crate::error::{Error, Result};
+use super::shown_images::{MEDIAN, ShownImage, brighter, data_uri, difference, shrink, shrinkage};
+use crate::error::Result;
 use crate::evaluation::ModelPair;
 use crate::files::image::write::jpeg_bytes;
 use crate::memory_plan::Workload;
@@ -93,7 +89,9 @@ pub fn render_films(pair: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
         let views = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), MAX_FRAMES);
         let made = pair.render_pairs(&views, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
-            let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));
+            let small = |image: &Image, most: u64| {
+                data_uri("jpeg", jpeg_bytes(&shrink(image, shrinkage(image, most)), JPEG_QUALITY))
+            };
             let images =
                 [small(original, MAX_PIXELS)?, small(compressed, MAX_PIXELS)?, small(&bright, MAX_DIFFERENCE_PIXELS)?];
             Ok((psnr(compressed, original), shrinkage(original, MAX_PIXELS), images))
@@ -113,11 +111,4 @@ pub fn render_films(pair: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
         });
     }
     Ok(films)
-}
-
-/// Returns `image` as a data URI that contains a JPEG file.
-fn data_uri(image: &Image) -> Result<String> {
-    let bytes = jpeg_bytes(image, JPEG_QUALITY)
-        .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;
-    Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)))
 }

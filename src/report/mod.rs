@@ -340,7 +340,7 @@ fn show_again(
         for (mode, _) in worst().filter(|&(_, at)| at == place) {
             let shares = failure::render_kind_shares(state, kinds, camera);
             let corner = failure::worst_corner(&renders, &shares, GaussianKind::ALL[mode]);
-            let square = |image| shown_images::data_uri(&failure::crop_square(image, corner));
+            let square = |image| shown_images::png_uri(&failure::crop_square(image, corner));
             let images = [square(&renders.original)?, square(&renders.compressed)?];
             worst_places.push(WorstPlaceImages { mode, corner, psnr: failure::crop_psnr(&renders, corner), images });
         }
