@@ -17,10 +17,11 @@ pub(super) fn header(results: &[Analysis], names: &[String]) -> String {
         out += &format!("<p class=\"verdict\">{name}{}</p>\n", escape(&result.data.verdict));
     }
     out += &table(results, names);
+    let has_times = results.iter().any(|result| result.data.render_time.is_some());
+    let times = if has_times { " Render times are per view, on one thread of this machine." } else { "" };
     out += &format!(
         "<p class=\"note\">Compared on {} renders of {} from {}: {}. PSNR has peak 1 and is averaged \
-         over renders; higher is better. From 40 dB on, two renders look alike. Render times are per view, on one \
-         thread of this machine.</p>\n",
+         over renders; higher is better. From 40 dB on, two renders look alike.{times}</p>\n",
         grouped(found.cameras.pairs),
         counted(found.loss.per_frame.len(), "frame"),
         counted(found.cameras.cameras, "camera"),
