@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use splatsieve::cache::Completion;
 use splatsieve::pipeline::{Request, Target, compress};
-use splatsieve::progress::{EventSink, Events, ExpectedStage, Message, Task, TaskSink};
+use splatsieve::progress::{EventSink, Events, Message, Task, TaskSink};
 use splatsieve::recipe::Recipe;
 use splatsieve::scene::InputOptions;
 
@@ -18,10 +18,8 @@ use splatsieve::scene::InputOptions;
 struct Printer;
 
 impl EventSink for Printer {
-    fn run_begun(&self, stages: &[ExpectedStage]) {
-        let names: Vec<&str> = stages.iter().map(|(name, _)| *name).collect();
-        let seconds: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
-        println!("{} in about {seconds:.0} s", names.join(", "));
+    fn run_begun(&self, stages: &[&'static str]) {
+        println!("stages: {}", stages.join(", "));
     }
 
     fn task_begun(&self, task: Task<'_>) -> Option<Box<dyn TaskSink>> {

@@ -2,8 +2,10 @@
 //! implements [`EventSink`] and passes it on in [`crate::scene::InputOptions::events`]; `examples/compress.rs` is such
 //! a program.
 
-use std::fmt::{self, Debug};
+use std::fmt::{self, Debug, Display};
 use std::sync::Arc;
+
+use bytesize::ByteSize;
 
 /// Receiver of the events of runs. Methods are called from any thread; default implementations ignore the event.
 ///
@@ -25,9 +27,9 @@ use std::sync::Arc;
 /// events.send(Message::Warning("few cameras"));
 /// ```
 pub trait EventSink: Send + Sync {
-    /// Receives the event that a run begins, with its `stages` in order. Each stage then begins with a task of the
+    /// Receives the event that a run begins, with the names of its `stages` in order. Each stage then begins with a task of the
     /// stage's name ([`EventSink::task_begun`]).
-    fn run_begun(&self, stages: &[ExpectedStage]) {
+    fn run_begun(&self, stages: &[&'static str]) {
         let _ = stages;
     }
 
@@ -57,9 +59,6 @@ pub trait TaskSink: Debug + Send + Sync {
     fn restarted(&mut self, total: u64);
 }
 
-/// Name of a stage, and its expected duration in seconds.
-pub type ExpectedStage = (&'static str, f64);
-
 /// Task that begins, such as a stage or a step of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Task<'a> {
@@ -74,7 +73,7 @@ pub struct Task<'a> {
 /// A message about a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Message<'a> {
-    /// Part of the memory plan or of the time forecast of a run, as lines of text. Sent only if
+    /// Part of the memory plan or of the forecast of a run, as lines of text. Sent only if
     /// [`crate::memory_plan::Budget::tell`] asks for it.
     Plan(&'a str),
     /// Problem that the user should solve before the run goes on, such as missing cameras.
@@ -107,8 +106,9 @@ impl Events {
         Events(Some(Arc::new(sink)))
     }
 
-    /// Announces the start of a run of `stages`. The run ends when the returned value is dropped.
-    pub fn begin_run(&self, stages: &[ExpectedStage]) -> RunGuard {
+    /// Announces the start of a run of the stages with the names `stages`. The run ends when the returned value is
+    /// dropped.
+    pub fn begin_run(&self, stages: &[&'static str]) -> RunGuard {
         if let Some(sink) = &self.0 {
             sink.run_begun(stages);
         }
@@ -181,6 +181,19 @@ pub fn counted(count: usize, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
+/// Formats a number of bytes with a decimal unit, such as "1.5 MB".
+pub fn decimal_bytes(bytes: u64) -> String {
+    ByteSize(bytes).display().si().to_string()
+}
+
+/// Formats a whole number with a comma between groups of three digits.
+pub fn grouped(number: impl Display) -> String {
+    let digits = number.to_string();
+    let groups: Vec<&str> =
+        digits.as_bytes().rchunks(3).rev().filter_map(|group| std::str::from_utf8(group).ok()).collect();
+    groups.join(",")
+}
+
 /// Formats a duration in seconds for display: "59.4 s", "1 min 00 s", "2 h 01 min".
 pub fn format_duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;
@@ -208,7 +221,7 @@ mod tests {
     }
 
     impl EventSink for Recorder {
-        fn run_begun(&self, stages: &[ExpectedStage]) {
+        fn run_begun(&self, stages: &[&'static str]) {
             self.record(format!("run {stages:?}"));
         }
 
@@ -240,7 +253,7 @@ mod tests {
     fn every_event_reaches_the_sink_in_order() {
         let recorder = Recorder::default();
         let events = Events::new(recorder.clone());
-        let run = events.begin_run(&[("scan", 1.0)]);
+        let run = events.begin_run(&["scan"]);
         let mut task = events.task("scan", "states", 7);
         task.advance(2);
         task.restart(9);
@@ -248,7 +261,7 @@ mod tests {
         events.send(Message::Plan("memory"));
         drop(run);
         let expected = [
-            r#"run [("scan", 1.0)]"#,
+            r#"run ["scan"]"#,
             "scan Some(7) states",
             "+2",
             "again 9",
@@ -257,6 +270,13 @@ mod tests {
             "run ended",
         ];
         assert_eq!(*recorder.0.lock().unwrap(), expected);
+    }
+
+    #[test]
+    fn numbers_are_grouped_by_three_digits() {
+        for (number, text) in [(0, "0"), (999, "999"), (20883, "20,883"), (1_234_567, "1,234,567")] {
+            assert_eq!(grouped(number), text);
+        }
     }
 
     #[test]

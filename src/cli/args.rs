@@ -9,14 +9,13 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 
-use self::choices::{FIT_TARGETS, IMAGE_FORMATS, LINK_MODES, OUTPUT_KINDS, SPLITS, choice};
-pub(super) use self::shared::{CacheArgs, CameraFile, Cameras, DryRun, Earlier, Input, Memory, Trained};
+use self::choices::{FIT_TARGETS, IMAGE_FORMATS, OUTPUT_KINDS, SPLITS, choice};
+pub(super) use self::shared::{CacheArgs, CameraFile, Cameras, DryRun, Input, Memory, ResultFlags, Trained};
 pub(super) use self::study::{PrecisionArgs, Sweep};
 use self::values::{parse_box, parse_bytes, parse_color, parse_count, parse_decibels, parse_ratio, parse_threads};
 use super::recipe_flags::RecipeFlags;
 use splatsieve::diagnostics::demo_scene::Playground;
 use splatsieve::files::image::write::ImageFormat;
-use splatsieve::models::LinkMode;
 use splatsieve::outputs::bounds::MaxError;
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::pipeline::FitTarget;
@@ -89,31 +88,6 @@ pub(super) enum CommandArgs {
     Man(Man),
 }
 
-impl CommandArgs {
-    /// Returns whether `--explain` was given.
-    pub(super) fn explains(&self) -> bool {
-        match self {
-            CommandArgs::Compress(args) => args.input.memory.explain,
-            CommandArgs::Score(ScoreArgs { input, .. })
-            | CommandArgs::Render(Render { input, .. })
-            | CommandArgs::View(ViewArgs { input, .. })
-            | CommandArgs::Convert(Convert { input, .. })
-            | CommandArgs::Info(InfoArgs { input, .. }) => input.memory.explain,
-            CommandArgs::Evaluate(Evaluate { models, .. }) | CommandArgs::Report(ReportArgs { models, .. }) => {
-                models.memory.explain
-            }
-            CommandArgs::Demo(Demo { memory, .. }) | CommandArgs::TestScene(TestScene { memory, .. }) => memory.explain,
-            CommandArgs::Sweep(_)
-            | CommandArgs::Precision(_)
-            | CommandArgs::Cache(_)
-            | CommandArgs::Selfcheck(_)
-            | CommandArgs::Recipe(_)
-            | CommandArgs::Completions(_)
-            | CommandArgs::Man(_) => false,
-        }
-    }
-}
-
 /// Format of an output.
 #[derive(Debug, Args)]
 pub(super) struct OutputFormat {
@@ -164,10 +138,7 @@ pub(super) struct Compress {
     #[arg(conflicts_with_all = ["dry_run", "shard"])]
     pub(super) view: Option<Option<PathBuf>>,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
-    /// Print the summary as JSON
-    #[arg(long)]
-    pub(super) json: bool,
+    pub(super) results: ResultFlags,
     /// Print stages with their times, what was left out and why, and all notes
     #[arg(short, long, conflicts_with = "json")]
     pub(super) verbose: bool,
@@ -240,11 +211,8 @@ pub(super) struct ScoreArgs {
     /// dynamic_score score keep, and W if visible contributions are measured
     #[arg(short, long, value_name = "FILE")]
     pub(super) output: PathBuf,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
+    pub(super) results: ResultFlags,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
 }
@@ -293,11 +261,8 @@ pub(super) struct Render {
     pub(super) output: Option<PathBuf>,
     #[command(flatten)]
     pub(super) cache_args: CacheArgs,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
+    pub(super) results: ResultFlags,
 }
 
 /// Background color.
@@ -311,23 +276,10 @@ pub(super) struct Background {
 /// Two models and the views that they are compared on.
 #[derive(Debug, Args)]
 pub(super) struct CompareArgs {
-    /// Original model: any input of `compress`
-    pub(super) original: PathBuf,
+    #[command(flatten)]
+    pub(super) input: Input,
     /// Compressed model, in any format
     pub(super) compressed: PathBuf,
-    /// Training iteration of the original, if it is a model folder [default: the largest]
-    #[arg(long, value_name = "K")]
-    pub(super) iteration: Option<u32>,
-    #[command(flatten)]
-    pub(super) trained: Trained,
-    /// Accept folders of PLY frames with missing frame numbers or with entries that are no files
-    #[arg(long)]
-    pub(super) allow_gaps: bool,
-    /// Tracking of frames, as for `compress` [default: auto]
-    #[arg(long, value_parser = choice(LINK_MODES))]
-    pub(super) link: Option<LinkMode>,
-    #[command(flatten)]
-    pub(super) memory: Memory,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
     /// Split of the data set whose views are compared [default: test, else val, else all]
@@ -372,11 +324,8 @@ pub(super) struct ReportArgs {
     pub(super) output: PathBuf,
     #[command(flatten)]
     pub(super) cache_args: CacheArgs,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
+    pub(super) results: ResultFlags,
 }
 
 /// Arguments of `evaluate`.
@@ -390,10 +339,7 @@ pub(super) struct Evaluate {
     #[command(flatten)]
     pub(super) cache_args: CacheArgs,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
+    pub(super) results: ResultFlags,
 }
 
 /// Arguments of `view`.
@@ -422,11 +368,8 @@ pub(super) struct ViewArgs {
     /// Output: NAME.html, a single page, or a folder with index.html; both open without a server
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
+    pub(super) results: ResultFlags,
 }
 
 /// Default maximum number of frames of a page.
@@ -478,11 +421,8 @@ pub(super) struct Convert {
     pub(super) level: Option<i32>,
     #[command(flatten)]
     pub(super) cache_args: CacheArgs,
-    /// Print the result as JSON
-    #[arg(long)]
-    pub(super) json: bool,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
+    pub(super) results: ResultFlags,
 }
 
 /// Arguments of `info`.
@@ -496,11 +436,8 @@ pub(super) struct InfoArgs {
     /// Write the complete frames of a damaged or truncated .gseq container to a new one
     #[arg(long, value_name = "FILE.gseq")]
     pub(super) repair: Option<PathBuf>,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
+    pub(super) results: ResultFlags,
 }
 
 /// Arguments of `cache`.
@@ -533,11 +470,8 @@ pub(super) struct Demo {
     pub(super) refine_steps: Option<u32>,
     #[command(flatten)]
     pub(super) memory: Memory,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
     #[command(flatten)]
-    pub(super) earlier: Earlier,
+    pub(super) results: ResultFlags,
 }
 
 /// Arguments of `test-scene`.
@@ -557,8 +491,9 @@ pub(super) struct TestScene {
     pub(super) ratio: f64,
     #[command(flatten)]
     pub(super) memory: Memory,
-    #[command(flatten)]
-    pub(super) earlier: Earlier,
+    /// Replace the files of an earlier result in the folder
+    #[arg(long)]
+    pub(super) overwrite: bool,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
 }

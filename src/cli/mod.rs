@@ -27,8 +27,8 @@ use splatsieve::memory_plan;
 
 /// Runs the program on the arguments of this process, and returns its exit code.
 pub(crate) fn main() -> ExitCode {
-    let cli = match parse(std::env::args_os()) {
-        Ok(cli) => cli,
+    let (cli, explains) = match parse(std::env::args_os()) {
+        Ok(parsed) => parsed,
         Err(error) => {
             // The message quotes arguments, which may hold control characters: parse again with them replaced.
             let shown = std::env::args_os().map(|word| word.shown().to_string().into());
@@ -40,7 +40,6 @@ pub(crate) fn main() -> ExitCode {
     };
     // Must run before the first output is begun.
     signals::install();
-    let explains = cli.command.explains();
     let result = run(cli);
     // The outputs that these warnings name are complete, so the exit code does not change.
     for warning in take_warnings() {
@@ -57,10 +56,15 @@ pub(crate) fn main() -> ExitCode {
     }
 }
 
-/// Parses the words of a command line. The first word is the name of the program.
-fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<Cli, clap::Error> {
-    let parsed = help::command().try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found));
-    parsed.map_err(with_plain_number_error)
+/// Parses the words of a command line. The first word is the name of the program. Also returns whether the peak memory
+/// is shown at the end: if `--explain` is given, except for commands that make several runs and measure each.
+fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<(Cli, bool), clap::Error> {
+    let found = help::command().try_get_matches_from(words).map_err(with_plain_number_error)?;
+    let explains = found.subcommand().is_some_and(|(command, flags)| {
+        let is_given = matches!(flags.try_get_one("explain"), Ok(Some(true)));
+        is_given && !["sweep", "precision"].contains(&command)
+    });
+    Ok((Cli::from_arg_matches(&found).map_err(with_plain_number_error)?, explains))
 }
 
 /// Returns `error`. If a value could not be parsed as a number, its message names the expected kind of number instead of

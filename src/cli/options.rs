@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use super::args::{
-    self, CacheArgs, CameraFile, Cameras, CompareArgs, Compress, Convert, Demo, Input, Memory, OutputFormat,
-    OutputSize, PrecisionArgs, Render, Sweep, TestScene, Trained, ViewArgs,
+    self, CacheArgs, CameraFile, CompareArgs, Compress, Convert, Demo, Input, Memory, OutputFormat, OutputSize,
+    PrecisionArgs, Render, Sweep, TestScene, Trained, ViewArgs,
 };
 use gseq::Compression;
 use splatsieve::cache::CacheRequest;
@@ -46,7 +46,8 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
     let is_flipped = args.input.trained.rot4d_unflipped == Some(false);
-    let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
+    let mut input = input_options(args.input, Some(args.cameras.file), Some(&args.output), events);
+    input.split = scored_split(args.cameras.split);
     input.work = cache_request(args.cache_args);
     if input.memory.tell == Verbosity::Nothing && !quiet {
         input.memory.tell = Verbosity::Time;
@@ -123,16 +124,16 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
         keep_ids: args.overrides.keep_ids.or(run.keep_ids),
         drop_ids: args.overrides.drop_ids.or(run.drop_ids),
         keep_box: args.overrides.keep_box.or(run.keep_box),
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
     })
 }
 
 /// Returns the library's options for `render` without `--video`.
 ///
 /// # Errors
-/// Fails if an option that needs `--video` is given.
+/// Fails if an option that needs `--video` is given, or if `--as` and the name of the output ask for different formats.
 pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOptions> {
-    // The parser accepts these options without --video.
+    // The parser accepts these options without --video, because --output excludes it.
     let video_flags =
         [("--path", args.path.is_some()), ("--fps", args.fps.is_some()), ("--beside", args.beside.is_some())];
     if let Some((flag, _)) = video_flags.into_iter().find(|(_, given)| *given) {
@@ -152,8 +153,7 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
              give a name that ends in .{asked}"
         )));
     }
-    let mut input = input_options(args.input, None, Some(&output), events);
-    args.cameras.apply_to(&mut input);
+    let mut input = input_options(args.input, Some(args.cameras), Some(&output), events);
     input.work = cache_request(args.cache_args);
     Ok(RenderOptions {
         input,
@@ -161,7 +161,7 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
         views: args.split.unwrap_or(views),
         background: args.background.background,
         output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
     })
 }
 
@@ -171,8 +171,7 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
         Some(views) => (VideoCamera::Path(views), ViewSet::HeldOut),
         None => (VideoCamera::View(args.view), ViewSet::All),
     };
-    let mut input = input_options(args.input, None, Some(&output), events);
-    args.cameras.apply_to(&mut input);
+    let mut input = input_options(args.input, Some(args.cameras), Some(&output), events);
     input.work = cache_request(args.cache_args);
     VideoOptions {
         input,
@@ -182,20 +181,14 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
         fps: args.fps.unwrap_or(25),
         background: args.background.background,
         output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
     }
 }
 
 /// Returns the library's options for comparing the renders of two models. The options request no CSV file of the
 /// scores; the caller can add one.
 pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
-    let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
-    original.allow_gaps = args.allow_gaps;
-    original.link = args.link.unwrap_or(LinkMode::Auto);
-    original.conventions = conventions(&args.trained);
-    args.cameras.apply_to(&mut original);
-    original.memory = memory_budget(args.memory);
-    original.events = events.clone();
+    let original = input_options(args.input, Some(args.cameras), None, events);
     EvaluateOptions {
         original,
         compressed: args.compressed,
@@ -212,8 +205,7 @@ pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOp
 
 /// Returns the library's options for `view`.
 pub(super) fn view_options(args: ViewArgs, events: &Events) -> ViewOptions {
-    let mut original = input_options(args.input, None, Some(&args.output), events);
-    args.cameras.apply_to(&mut original);
+    let original = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     ViewOptions {
         original,
         compressed: args.compressed,
@@ -223,7 +215,7 @@ pub(super) fn view_options(args: ViewArgs, events: &Events) -> ViewOptions {
         background: args.background.background,
         page_limit: args.page_limit,
         output: args.output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
     }
 }
 
@@ -263,8 +255,7 @@ pub(super) fn result_page_options(request: &Request, output: Option<PathBuf>) ->
 
 /// Returns the library's options for `sweep`.
 pub(super) fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
-    let mut input = input_options(args.input, None, Some(&args.output), events);
-    args.cameras.apply_to(&mut input);
+    let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     let named = |name: &String| Method::ALL.into_iter().find(|method| method.name() == name);
     SweepOptions {
         input,
@@ -276,7 +267,7 @@ pub(super) fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
         max_frames: Some(args.max_frames as usize),
         background: args.background.background,
         output: args.output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
     }
 }
 
@@ -285,8 +276,7 @@ pub(super) fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
 /// # Errors
 /// Fails if the recipe is invalid.
 pub(super) fn precision_options(args: PrecisionArgs, events: &Events) -> Result<PrecisionOptions> {
-    let mut input = input_options(args.input, None, Some(&args.output), events);
-    args.cameras.apply_to(&mut input);
+    let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     let named = |name: &String| Knob::ALL.into_iter().find(|knob| knob.name() == name);
     let knobs: Vec<Knob> = args.knobs.iter().filter_map(named).collect();
     Ok(PrecisionOptions {
@@ -297,7 +287,7 @@ pub(super) fn precision_options(args: PrecisionArgs, events: &Events) -> Result<
         max_frames: args.max_frames as usize,
         runs: args.repeat as usize,
         output: args.output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
     })
 }
 
@@ -308,7 +298,7 @@ pub(super) fn demo_options(args: Demo, events: &Events) -> DemoOptions {
         frames: args.frames as usize,
         steps: args.refine_steps,
         output: args.output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
         memory: memory_budget(args.memory),
         events: events.clone(),
     }
@@ -325,7 +315,7 @@ pub(super) fn test_scene_options(args: TestScene, events: &Events) -> Result<Tes
         kept: Target::Ratio(args.ratio),
         recipe: args.recipe.recipe()?,
         output: args.output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.overwrite),
         memory: memory_budget(args.memory),
         events: events.clone(),
     })
@@ -358,6 +348,11 @@ pub(super) fn cache_request(cache_args: CacheArgs) -> Option<CacheRequest> {
     cache_args.cache.map(|folder| CacheRequest { folder, shard: cache_args.shard })
 }
 
+/// Returns the policy for an output path that already exists, from the flag `--overwrite`.
+pub(super) fn replace(overwrite: bool) -> Replace {
+    if overwrite { Replace::Existing } else { Replace::Never }
+}
+
 /// Returns the library's memory settings: the memory limit, and whether the memory plan is printed. If a limit is
 /// given, also makes the allocator return freed memory to the system at once, on systems that support this.
 fn memory_budget(memory: Memory) -> Budget {
@@ -367,47 +362,41 @@ fn memory_budget(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 
-/// Returns the training conventions (facts about the training that model files do not record) that the command line
-/// states in `trained`.
-fn conventions(trained: &Trained) -> TrainingConventions {
-    let &Trained { time_duration, rot4d_unflipped, zero_rotation } = trained;
-    TrainingConventions { time_duration, rot4d_unflipped: rot4d_unflipped.unwrap_or(false), zero_rotation }
+/// Returns the split whose views Gaussians are scored by, from the option `--split`; `None` for the views of all
+/// splits.
+pub(super) fn scored_split(split: Option<ViewSet>) -> Option<Split> {
+    match split {
+        None => Some(Split::Train),
+        Some(ViewSet::Split(split)) => Some(split),
+        Some(ViewSet::All | ViewSet::HeldOut) => None,
+    }
 }
 
-/// Returns the library's options for opening an input. If `cameras` is `None`, cameras and split keep their defaults.
-/// Temporary files go to the folder that `--scratch-dir` names. Without this option, they go to the folder that
-/// contains `output`, or to the system's folder for temporary files if `output` is `None`.
+/// Returns the library's options for opening an input, with cameras if the command has any. Temporary files go to the
+/// folder that `--scratch-dir` names. Without this option, they go to the folder that contains `output`, or to the
+/// system's folder for temporary files if `output` is `None`.
 pub(super) fn input_options(
     input: Input,
-    cameras: Option<Cameras>,
+    cameras: Option<CameraFile>,
     output: Option<&Path>,
     events: &Events,
 ) -> InputOptions {
     let events = events.clone();
     let mut options = InputOptions { path: input.input, iteration: input.iteration, events, ..InputOptions::default() };
     options.allow_gaps = input.allow_gaps;
-    options.conventions = conventions(&input.trained);
+    // Facts about the training that model files do not record.
+    let Trained { time_duration, rot4d_unflipped, zero_rotation } = input.trained;
+    let rot4d_unflipped = rot4d_unflipped.unwrap_or(false);
+    options.conventions = TrainingConventions { time_duration, rot4d_unflipped, zero_rotation };
     options.link = input.link.unwrap_or(LinkMode::Auto);
     options.memory = memory_budget(input.memory);
     options.is_scratch_named = input.scratch_dir.is_some();
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
-        cameras.file.apply_to(&mut options);
-        options.split = match cameras.split {
-            None => Some(Split::Train),
-            Some(ViewSet::Split(split)) => Some(split),
-            Some(ViewSet::All | ViewSet::HeldOut) => None,
-        };
+        options.cameras = cameras.cameras;
+        options.size = cameras.resolution;
+        options.times = cameras.times.unwrap_or_default();
+        options.frames = cameras.frames.map(|frames| frames as usize);
     }
     options
-}
-
-impl CameraFile {
-    /// Copies cameras, resolution, times and number of frames from these arguments of the command line into `options`.
-    fn apply_to(self, options: &mut InputOptions) {
-        options.cameras = self.cameras;
-        options.size = self.resolution;
-        options.times = self.times.unwrap_or_default();
-        options.frames = self.frames.map(|frames| frames as usize);
-    }
 }

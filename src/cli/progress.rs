@@ -1,9 +1,6 @@
 //! Progress on standard error. On a terminal, every task has a bar with rate and time left; the bar of a nested task (a
 //! task that runs within another) is below it. In a log, a task prints at most one line per minute while it runs, and
 //! one line when it ends; a nested task prints none at its end.
-//!
-//! A line wider than the terminal would not be erased completely when it is redrawn. Therefore lines are composed from
-//! the parts that fit.
 
 use std::fmt::Write as _;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -15,23 +12,20 @@ use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressDrawTarget, Prog
 
 use super::message::{is_terminal, show};
 use splatsieve::error::printable;
-use splatsieve::progress::{EventSink, ExpectedStage, Message, Task, TaskSink, format_duration};
+use splatsieve::progress::{EventSink, Message, Task, TaskSink, format_duration};
 
 /// Minimum time between two log lines of one task, seconds.
 const LOG_INTERVAL_SECONDS: u64 = 60;
 
 /// Assumed width of a terminal that does not report its width, in columns (characters).
 const DEFAULT_COLUMNS: u16 = 80;
-/// Maximum width of a progress bar, in columns (characters).
-const MAX_BAR_COLUMNS: usize = 30;
-/// Minimum width of a progress bar, in columns (characters). A shorter bar shows no more than the percentage does.
-const MIN_BAR_COLUMNS: usize = 8;
+/// Width of a progress bar, in columns (characters).
+const BAR_COLUMNS: usize = 20;
 
 /// Receiver of the library's events, which displays them on standard error.
 pub(super) struct Display {
     /// Whether to hide progress, and messages that the result of a stage is not used ([`Message::Discarded`]). Two
-    /// kinds of messages are always shown: warnings, and memory plans with time forecasts ([`Message::Plan`]), which
-    /// are sent only on request.
+    /// kinds of messages are always shown: warnings, and plans ([`Message::Plan`]), which are sent only on request.
     is_quiet: bool,
     shared: Arc<Shared>,
 }
@@ -43,15 +37,24 @@ struct Shared {
     bars: MultiProgress,
     /// Number of tasks that are running and whose progress is written as log lines, not shown as a bar.
     logs: AtomicUsize,
-    /// Stages, start and running stage of the compression that is running; `None` if none is running.
-    run: Mutex<Option<RunPosition>>,
+    /// Names of the stages of the run that was announced last; empty after it has ended.
+    stages: Mutex<Vec<&'static str>>,
 }
 
 impl Shared {
-    /// Locks the field `run` and returns its content. Ignores poisoning: a panicked thread cannot leave it
+    /// Locks the field `stages` and returns its content. Ignores poisoning: a panicked thread cannot leave it
     /// inconsistent.
-    fn run(&self) -> MutexGuard<'_, Option<RunPosition>> {
-        self.run.lock().unwrap_or_else(PoisonError::into_inner)
+    fn stages(&self) -> MutexGuard<'_, Vec<&'static str>> {
+        self.stages.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns the label of the task `name`: `[k/n] name` if it is stage k of the n stages of the run, else `name`.
+    fn label(&self, name: &str) -> String {
+        let stages = self.stages();
+        match stages.iter().position(|stage| *stage == name) {
+            Some(place) => format!("[{}/{}] {name}", place + 1, stages.len()),
+            None => name.to_owned(),
+        }
     }
 }
 
@@ -59,25 +62,21 @@ impl Display {
     /// Creates a display of the library's events; `is_quiet` hides progress.
     pub(super) fn new(is_quiet: bool) -> Self {
         let bars = MultiProgress::with_draw_target(ProgressDrawTarget::stderr_with_hz(10));
-        Display { is_quiet, shared: Arc::new(Shared { bars, logs: AtomicUsize::new(0), run: Mutex::new(None) }) }
+        Display { is_quiet, shared: Arc::new(Shared { bars, logs: AtomicUsize::new(0), stages: Mutex::default() }) }
     }
 
     /// Adds a progress bar for `task`, labeled `name`. Returns the bar.
     fn bar(&self, task: Task<'_>, name: String) -> Bar {
         let bar = self.shared.bars.add(task.total.map_or_else(ProgressBar::no_length, ProgressBar::new));
         if let Ok(style) = ProgressStyle::with_template("{line}") {
-            let (unit, shared) = (task.unit.to_owned(), self.shared.clone());
-            // Only the bar of a stage shows the time left of the run. The label of a stage differs from the task name:
-            // it begins with the number `[k/n]`.
-            let is_stage = name != task.name;
+            let unit = task.unit.to_owned();
             let line = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
                 let columns = Term::stderr().size_checked().map_or(DEFAULT_COLUMNS, |(_, columns)| columns);
-                let run = shared.run();
-                let run = run.as_ref().filter(|_| is_stage);
-                // Writing to the draw buffer cannot fail. The last column stays free: some terminals wrap after it.
-                let _ = out.write_str(
-                    &BarSnapshot::new(state, &name, run, &unit).line(usize::from(columns).saturating_sub(1)),
-                );
+                let (done, left) = (state.pos(), state.eta().as_secs_f64());
+                let line = bar_line(&name, done, state.len(), &unit, state.per_sec(), left);
+                // A line wider than the terminal would not be erased completely when it is redrawn. The last column
+                // stays free: some terminals wrap after it. Writing to the draw buffer cannot fail.
+                let _ = out.write_str(&line.chars().take(usize::from(columns).saturating_sub(1)).collect::<String>());
             };
             bar.set_style(style.with_key("line", line));
         }
@@ -87,23 +86,20 @@ impl Display {
 }
 
 impl EventSink for Display {
-    /// Begins a run with the stages `stages`. From now on, labels of stages show `[k/n]`, and bars show the time left
-    /// of the run.
-    fn run_begun(&self, stages: &[ExpectedStage]) {
-        *self.shared.run() = Some(RunPosition { stages: stages.to_vec(), start: Instant::now(), current: None });
+    /// Begins a run with the stages `stages`. From now on, labels of stages show `[k/n]`.
+    fn run_begun(&self, stages: &[&'static str]) {
+        *self.shared.stages() = stages.to_vec();
     }
 
     fn run_ended(&self) {
-        *self.shared.run() = None;
+        self.shared.stages().clear();
     }
 
     fn task_begun(&self, task: Task<'_>) -> Option<Box<dyn TaskSink>> {
         if self.is_quiet {
             return None;
         }
-        let mut run = self.shared.run();
-        let name = run.as_mut().map_or_else(|| task.name.to_owned(), |run| run.enter(task.name, Instant::now()));
-        drop(run);
+        let name = self.shared.label(task.name);
         Some(match is_terminal() {
             true => Box::new(self.bar(task, name)),
             false => Box::new(Log::new(name, task, self.shared.clone())),
@@ -152,112 +148,28 @@ impl Drop for Bar {
     }
 }
 
-/// Progress of a run (one compression): its stages, its start, and the stage that is running.
-#[derive(Debug)]
-struct RunPosition {
-    /// Name and expected duration, in seconds, of each stage.
-    stages: Vec<(&'static str, f64)>,
-    start: Instant,
-    /// Index of the running stage and the time of its start; `None` before the first stage.
-    current: Option<(usize, Instant)>,
-}
-
-impl RunPosition {
-    /// Returns the label of the task `name`, which begins at the time `now`. If the task is a stage of the run, records
-    /// it as the running stage, and the label is `[k/n] name`: stage k of n. For any other task the label is `name`.
-    fn enter(&mut self, name: &str, now: Instant) -> String {
-        let Some(place) = self.stages.iter().position(|(stage, _)| *stage == name) else { return name.to_owned() };
-        if self.current.is_none_or(|(stage, _)| stage != place) {
-            self.current = Some((place, now));
-        }
-        format!("[{}/{}] {name}", place + 1, self.stages.len())
+/// Returns the line of a progress bar: name, bar, percentage, count, rate and time left. `total`: number of units of
+/// the task; `None` if unknown, 0 while the task is still being prepared. `left`: estimated seconds until the end of
+/// the task; shown from 1 second on.
+fn bar_line(name: &str, done: u64, total: Option<u64>, unit: &str, per_second: f64, left: f64) -> String {
+    let mut line = format!("{name:>10}");
+    let total = total.filter(|&total| total > 0);
+    if let Some(total) = total {
+        let fraction = (done as f64 / total as f64).min(1.0);
+        let full = (fraction * BAR_COLUMNS as f64) as usize;
+        let percent = (100.0 * fraction).floor();
+        line += &format!(" [{}{}] {percent:>3.0}%", "=".repeat(full), " ".repeat(BAR_COLUMNS - full));
     }
-
-    /// Returns the estimated time from `now` until the end of the run, seconds. `step`: estimated time until the end of
-    /// the running stage, extrapolated from the speed of its progress bar, seconds; 0 if unknown.
-    /// - Before the first stage, the result is `step`.
-    /// - Later, the result is the sum of two times: the time left of the running stage, and the expected times of all
-    ///   later stages. The time left of the running stage is its expected time minus its elapsed time, but at least
-    ///   `step`.
-    /// - Expected times are first multiplied by a correction: the ratio of actual to expected time of all finished
-    ///   stages, limited to 0.1 to 10. The correction is 1 if their expected time is below half a second.
-    fn left(&self, step: f64, now: Instant) -> f64 {
-        let Some((place, since)) = self.current else { return step };
-        let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
-        let before = expected(&self.stages[..place]);
-        // Below half a second of expected time, the ratio is too noisy.
-        let correction = match before >= 0.5 {
-            true => ((since - self.start).as_secs_f64() / before).clamp(0.1, 10.0),
-            false => 1.0,
-        };
-        let stage_left = correction * self.stages[place].1 - (now - since).as_secs_f64();
-        stage_left.max(step) + correction * expected(&self.stages[place + 1..])
+    // The rate and the time left are unknown before the first unit is done.
+    if done == 0 {
+        return line;
     }
-}
-
-/// Data that a progress bar shows at one moment.
-struct BarSnapshot<'a> {
-    name: &'a str,
-    unit: &'a str,
-    done: u64,
-    total: Option<u64>,
-    per_second: f64,
-    /// Estimated seconds left of the task; `None` if unknown.
-    left: Option<f64>,
-    /// Estimated seconds until the end of the whole run to which the task belongs; `None` for a task outside a run.
-    run: Option<f64>,
-}
-
-impl<'a> BarSnapshot<'a> {
-    /// Returns the data that a progress bar shows about the task `name`. `state`: progress of the task, counted in
-    /// `unit`. `run`: progress of the run, if the task is a stage of it; `None` for any other task.
-    fn new(state: &ProgressState, name: &'a str, run: Option<&RunPosition>, unit: &'a str) -> BarSnapshot<'a> {
-        let (done, total) = (state.pos(), state.len());
-        // The rate is unknown before the first unit is done.
-        let left = total.filter(|&total| done > 0 && total > done).map(|_| state.eta().as_secs_f64());
-        let run = run.map(|run| run.left(left.unwrap_or(0.0), Instant::now()));
-        BarSnapshot { name, unit, done, total, per_second: state.per_sec(), left, run }
+    let total_text = total.map_or(String::new(), |total| format!("/{}", HumanCount(total)));
+    line += &format!(" {}{total_text} {unit}, {}", HumanCount(done), rate(per_second, unit));
+    if left >= 1.0 && total.is_some_and(|total| total > done) {
+        line += &format!(", {} left", whole_seconds(left));
     }
-
-    /// Returns the text of the bar, at most `columns` characters long. The name is always shown; the other parts are
-    /// added while they fit, in this order: percentage, time left, count, rate, time left of the run, bar.
-    fn line(&self, columns: usize) -> String {
-        let BarSnapshot { name, unit, done, total, per_second, left, run } = self;
-        let is_shown = |seconds: &&f64| **seconds >= 1.0;
-        // A total of 0 means that the task is still being prepared.
-        let total = total.filter(|&total| total > 0);
-        let fraction = total.map(|total| (*done as f64 / total as f64).min(1.0));
-        let total_text = total.map_or(String::new(), |total| format!("/{}", HumanCount(total)));
-        let pieces = [
-            fraction.map(|fraction| format!("{:>3.0}%", (100.0 * fraction).floor())),
-            left.as_ref().filter(is_shown).map(|left| format!("{} left", whole_seconds(*left))),
-            Some(format!("{}{total_text} {unit}", HumanCount(*done))).filter(|_| *done > 0 || total.is_some()),
-            Some(rate(*per_second, unit)).filter(|_| *done > 0),
-            run.as_ref().filter(is_shown).map(|run| format!("the run {}", whole_seconds(*run))),
-        ];
-        let mut shown = [false; 5];
-        let mut width = name.chars().count().max(10);
-        for (piece, shown) in pieces.iter().zip(&mut shown) {
-            let more = piece.as_ref().map_or(0, |piece| piece.chars().count() + 2);
-            *shown = piece.is_some() && width + more <= columns;
-            width += if *shown { more } else { 0 };
-        }
-        let [percent, left, count, rate, run] = std::array::from_fn(|k| pieces[k].as_ref().filter(|_| shown[k]));
-        let mut line = format!("{name:>10}");
-        if let Some(fraction) = fraction {
-            let bar_columns = columns.saturating_sub(width + 3).min(MAX_BAR_COLUMNS);
-            if bar_columns >= MIN_BAR_COLUMNS {
-                let full = (fraction * bar_columns as f64) as usize;
-                line += &format!(" [{}{}]", "=".repeat(full), " ".repeat(bar_columns - full));
-            }
-        }
-        line.extend(percent.map(|percent| format!(" {percent}")));
-        let rest: Vec<&str> = [count, rate, left, run].into_iter().flatten().map(String::as_str).collect();
-        if !rest.is_empty() {
-            line += &format!(" {}", rest.join(", "));
-        }
-        line.chars().take(columns).collect()
-    }
+    line
 }
 
 /// Formats an estimated time, rounded down to whole seconds.
@@ -400,48 +312,25 @@ mod tests {
     }
 
     #[test]
-    fn bar_lines_fit_the_columns_and_hide_times_below_a_second() {
-        let snapshot = BarSnapshot {
-            name: "[3/9] rounds",
-            unit: "views",
-            done: 1234,
-            total: Some(5000),
-            per_second: 12.0,
-            left: Some(313.0),
-            run: Some(4000.0),
-        };
-        for columns in 0..200 {
-            let line = snapshot.line(columns);
-            assert!(line.chars().count() <= columns, "{columns}: {line}");
-        }
+    fn bar_lines_have_progress_and_hide_times_below_a_second() {
+        let line = |total, left| bar_line("[3/9] rounds", 1234, total, "views", 12.0, left);
         assert_eq!(
-            snapshot.line(113),
-            "[3/9] rounds [=====                   ]  24% 1,234/5,000 views, 12 views/s, 5 min 13 s left, \
-             the run 1 h 06 min"
+            line(Some(5000), 313.0),
+            "[3/9] rounds [====                ]  24% 1,234/5,000 views, 12 views/s, 5 min 13 s left"
         );
-        assert_eq!(snapshot.line(75), "[3/9] rounds  24% 1,234/5,000 views, 12 views/s, 5 min 13 s left");
-        assert_eq!(snapshot.line(29), "[3/9] rounds [=       ]  24%");
-        let nearly = BarSnapshot { left: Some(0.4), run: Some(0.2), ..snapshot };
-        assert!(!nearly.line(119).contains("left") && !nearly.line(119).contains("run"), "{}", nearly.line(119));
-        let counting = BarSnapshot { total: None, left: None, run: None, ..nearly };
-        assert_eq!(counting.line(119), "[3/9] rounds 1,234 views, 12 views/s");
+        assert!(!line(Some(5000), 0.4).contains("left"));
+        assert_eq!(line(None, 313.0), "[3/9] rounds 1,234 views, 12 views/s");
+        let prepared = bar_line("scan", 0, Some(7), "states", 0.0, 0.0);
+        assert_eq!(prepared, "      scan [                    ]   0%");
     }
 
     #[test]
-    fn stages_are_numbered_and_time_left_follows_past_stages() {
-        let start = Instant::now();
-        let after = |seconds| start + Duration::from_secs(seconds);
-        let stages = vec![("scan", 10.0), ("score", 0.0), ("rounds", 30.0), ("emit", 5.0)];
-        let mut run = RunPosition { stages, start, current: None };
-        assert_eq!(run.enter("motion", start), "motion");
-        assert_eq!(run.left(2.0, start), 2.0);
-        assert_eq!(run.enter("scan", start), "[1/4] scan");
-        assert_eq!(run.left(8.0, after(4)), 8.0 + 35.0);
-        // The first stage took twice the expected time, so later stages are expected to.
-        assert_eq!(run.enter("rounds", after(20)), "[3/4] rounds");
-        assert_eq!(run.left(1.0, after(30)), 50.0 + 10.0);
-        // Entering the same stage again does not restart it.
-        assert_eq!(run.enter("rounds", after(60)), "[3/4] rounds");
-        assert_eq!(run.left(7.0, after(90)), 7.0 + 10.0);
+    fn stages_of_a_run_are_numbered() {
+        let display = Display::new(false);
+        display.run_begun(&["scan", "score", "rounds", "emit"]);
+        let labels = ["motion", "scan", "rounds", "rounds"].map(|name| display.shared.label(name));
+        assert_eq!(labels, ["motion", "[1/4] scan", "[3/4] rounds", "[3/4] rounds"]);
+        display.run_ended();
+        assert_eq!(display.shared.label("scan"), "scan");
     }
 }

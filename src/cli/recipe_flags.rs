@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
-use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
+use clap::{Arg, Args, Command};
 
 use splatsieve::error::{Error, Result, ShowPath, quoted};
 use splatsieve::files::text::read_text;
@@ -31,13 +31,26 @@ enum RecipeSetting {
 
 /// Recipe options of a command line. They apply in this order: a preset or a file, then an effort, then single
 /// parameters.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Args)]
 pub(super) struct RecipeFlags {
+    /// Recipe to start from: `default`, the best known; `paper`, as published; `gentle`, removes less; `strong`,
+    /// removes more. `paper` and `gentle` do not refine
+    #[arg(long, help_heading = HEADING, value_parser = PRESETS.map(|(name, _)| name))]
     preset: Option<String>,
+    /// TOML file with any of the parameters; others come from --preset. The recipe.toml beside a result repeats its run
+    #[arg(long = "recipe", help_heading = HEADING, value_name = "FILE")]
     file: Option<PathBuf>,
+    /// Time to spend on quality: `fast`, a third of the refinement steps and coarser ranking; `best`, three times the
+    /// steps
+    #[arg(long, help_heading = HEADING, value_parser = Effort::ALL.map(Effort::name))]
     effort: Option<String>,
+    /// Set a parameter of the recipe; may be repeated. `splatsieve recipe --preset paper` lists all with their meaning
+    #[arg(long = "set", help_heading = HEADING, value_name = "KEY=VALUE", value_parser = SettingParser)]
+    #[arg(hide_possible_values = true)]
     settings: Vec<RecipeSetting>,
-    has_no_refine: bool,
+    /// Leave out refinement: kept Gaussians stay as they are, similar ones are merged
+    #[arg(long, help_heading = HEADING)]
+    no_refine: bool,
 }
 
 impl RecipeFlags {
@@ -97,7 +110,7 @@ impl RecipeFlags {
                 ))
             })?;
         }
-        if self.has_no_refine {
+        if self.no_refine {
             recipe = recipe.without_refinement();
         }
         let passes = self.settings.iter().filter_map(|setting| match setting {
@@ -110,53 +123,6 @@ impl RecipeFlags {
         }
         recipe.validate().map_err(Error::usage)?;
         Ok(recipe)
-    }
-}
-
-impl Args for RecipeFlags {
-    fn augment_args(command: Command) -> Command {
-        let arg = |name: &'static str| Arg::new(name).long(name).help_heading(HEADING);
-        let preset = arg("preset")
-            .value_parser(PRESETS.map(|(name, _)| name))
-            .help("Recipe to start from: `default`, the best known; `paper`, as published; `gentle`, removes less; `strong`, removes more. `paper` and `gentle` do not refine");
-        let file = arg("recipe")
-            .value_name("FILE")
-            .value_parser(clap::value_parser!(PathBuf))
-            .help("TOML file with any of the parameters; others come from --preset. The recipe.toml beside a result repeats its run");
-        let effort = arg("effort")
-            .value_parser(Effort::ALL.map(Effort::name))
-            .help("Time to spend on quality: `fast`, a third of the refinement steps and coarser ranking; `best`, three times the steps");
-        let set = arg("set")
-            .value_name("KEY=VALUE")
-            .action(clap::ArgAction::Append)
-            .value_parser(SettingParser)
-            .hide_possible_values(true)
-            .help("Set a parameter of the recipe; may be repeated. `splatsieve recipe --preset paper` lists all with their meaning");
-        let no_refine = arg("no-refine")
-            .action(clap::ArgAction::SetTrue)
-            .help("Leave out refinement: kept Gaussians stay as they are, similar ones are merged");
-        command.args([preset, file, effort, set, no_refine])
-    }
-
-    fn augment_args_for_update(command: Command) -> Command {
-        Self::augment_args(command)
-    }
-}
-
-impl FromArgMatches for RecipeFlags {
-    fn from_arg_matches(matches: &ArgMatches) -> std::result::Result<Self, clap::Error> {
-        let mut flags = RecipeFlags::default();
-        flags.update_from_arg_matches(matches)?;
-        Ok(flags)
-    }
-
-    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> std::result::Result<(), clap::Error> {
-        self.preset = matches.get_one::<String>("preset").cloned();
-        self.file = matches.get_one::<PathBuf>("recipe").cloned();
-        self.effort = matches.get_one::<String>("effort").cloned();
-        self.settings = matches.get_many::<RecipeSetting>("set").into_iter().flatten().cloned().collect();
-        self.has_no_refine = matches.get_flag("no-refine");
-        Ok(())
     }
 }
 
@@ -229,6 +195,7 @@ pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<V
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::FromArgMatches;
     use splatsieve::model::Attributes;
 
     fn parse(args: &[&str]) -> Result<Recipe> {
@@ -265,7 +232,7 @@ mod tests {
 
     #[test]
     fn values_out_of_range_name_the_parameter_and_the_range() {
-        assert!(message(&["--set", "mu=-1"]).contains("score.mu: expected 0 to 1e6, found -1"));
+        assert!(message(&["--set", "mu=-1"]).contains("score.mu: expected 0 to 1000000, found -1"));
         assert!(message(&["--set", "passes=-1,1,0,0"]).contains("merge.passes.epsilon"));
         assert!(message(&["--set", "clip_norm=maybe"]).contains("clip_norm"));
         for setting in ["mu=many", "low_priority=maybe", "keep_fraction=1.5"] {

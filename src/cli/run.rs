@@ -3,15 +3,15 @@
 use std::path::Path;
 
 use super::args::{
-    CacheFolder, Cameras, Cli, CommandArgs, Completions, Compress, Convert, Demo, DryRun, Evaluate, InfoArgs, Man,
+    CacheFolder, Cli, CommandArgs, Completions, Compress, Convert, Demo, DryRun, Evaluate, InfoArgs, Man,
     PrecisionArgs, Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene, ViewArgs,
 };
 use super::help;
 use super::message::show;
 use super::options::{
     cache_request, compress_options, demo_options, evaluate_options, input_options, precision_options, render_options,
-    requested_kind, result_page_options, storage_precision, sweep_options, test_scene_options, video_options,
-    view_options,
+    replace, requested_kind, result_page_options, scored_split, storage_precision, sweep_options, test_scene_options,
+    video_options, view_options,
 };
 use super::output::{self, print, print_as};
 use super::progress::Display;
@@ -69,7 +69,7 @@ pub(super) fn run(cli: Cli) -> Result<()> {
 /// Runs the command `compress` and prints its summary. With `--dry-run`, only prints the plan of the run; with
 /// `--dry-run=stages`, only the stages that can be divided into shards. `quiet`: whether progress is hidden.
 fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
-    let (json, dry_run) = (args.json, args.dry_run);
+    let (json, dry_run) = (args.results.json, args.dry_run);
     let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Brief };
     let page_output = args.view.clone();
     if dry_run == Some(DryRun::Stages) && args.cache_args.shard.is_some() {
@@ -103,21 +103,20 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
 /// Runs the command `score`, which writes a table of the statistics and scores of all Gaussians. Prints notes, and the
 /// number of Gaussians that a compression with the recipe would keep before merging.
 fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
-    let as_json = args.json;
-    let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
-    let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
-    let (output, gaussians, kept) = (report.output.shown(), report.gaussians, report.kept);
-    let value = serde_json::json!({
-        "output": report.output.to_string_lossy(), "gaussians": gaussians, "kept": kept, "notes": report.notes,
-    });
-    let text = || format!("{output}: {gaussians} Gaussians, of which the recipe keeps {kept} before merging\n");
-    print_result(as_json, &value, &report.notes, text)
+    let as_json = args.results.json;
+    let mut input = input_options(args.input, Some(args.cameras.file), Some(&args.output), events);
+    input.split = scored_split(args.cameras.split);
+    let report = score::score(&input, &args.output, &args.recipe.recipe()?, replace(args.results.overwrite))?;
+    print_result(as_json, &report, &report.notes, || {
+        let (output, gaussians, kept) = (report.output.shown(), report.gaussians, report.kept);
+        format!("{output}: {gaussians} Gaussians, of which the recipe keeps {kept} before merging\n")
+    })
 }
 
 /// Runs the command `render`, which writes images, or with `--video` a video. Prints its notes and a description of the
 /// output.
 fn run_render(mut args: Render, events: &Events) -> Result<()> {
-    let as_json = args.json;
+    let as_json = args.results.json;
     if let Some(output) = args.video.take() {
         let options = video_options(args, output, events);
         let filmed = video(&options)?;
@@ -135,19 +134,21 @@ fn run_render(mut args: Render, events: &Events) -> Result<()> {
     }
     let options = render_options(args, events)?;
     let Some(rendered) = completed(render::render(&options)?)? else { return Ok(()) };
-    let plural = if rendered.views == 1 { "" } else { "s" };
     let value = serde_json::json!({
         "output": options.output.to_string_lossy(), "views": rendered.views, "notes": rendered.notes,
     });
-    let text = || format!("{}: {} view{plural}\n", options.output.shown(), rendered.views);
+    let text = || format!("{}: {}\n", options.output.shown(), counted(rendered.views, "view"));
     print_result(as_json, &value, &rendered.notes, text)
 }
 
 /// Runs the command `evaluate` and prints the comparison of the two models.
 fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
-    let as_json = args.json;
-    let mut options =
-        EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models, events) };
+    let as_json = args.results.json;
+    let mut options = EvaluateOptions {
+        csv: args.csv,
+        overwrite: replace(args.results.overwrite),
+        ..evaluate_options(args.models, events)
+    };
     options.original.work = cache_request(args.cache_args);
     let Some(found) = completed(evaluation::evaluate(&options)?)? else { return Ok(()) };
     tell_notes(&found.work_notes);
@@ -156,21 +157,21 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
 
 /// Runs the command `sweep` and prints its measurements and the path of its page.
 fn run_sweep(args: Sweep, events: &Events) -> Result<()> {
-    let (as_json, page) = (args.json, args.output.join(trade_off::PAGE_FILE));
+    let (as_json, page) = (args.results.json, args.output.join(trade_off::PAGE_FILE));
     let found = sweep::sweep(&sweep_options(args, events))?;
     print_as(as_json, || json_text(&found), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs the command `precision` and prints its measurements and the path of its page.
 fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
-    let (as_json, page) = (args.json, args.output.join(report::precision::PAGE_FILE));
+    let (as_json, page) = (args.results.json, args.output.join(report::precision::PAGE_FILE));
     let found = precision::precision(&precision_options(args, events)?)?;
     print_as(as_json, || json_text(&found), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs the command `report` and prints the verdict on each compressed model, the notes, and the path of the page.
 fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
-    let (as_json, page) = (args.json, args.output.join(report::PAGE_FILE));
+    let (as_json, page) = (args.results.json, args.output.join(report::PAGE_FILE));
     let mut evaluate = evaluate_options(args.models, events);
     evaluate.original.work = cache_request(args.cache_args);
     let options = ReportOptions {
@@ -180,7 +181,7 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
         precision: args.precision,
         render_time: args.render_time,
         output: args.output,
-        overwrite: args.earlier.replace(),
+        overwrite: replace(args.results.overwrite),
     };
     let Some(found) = completed(report::report(&options)?)? else { return Ok(()) };
     let results: Vec<_> = std::iter::once(&found.result).chain(&found.others).collect();
@@ -205,13 +206,9 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
 
 /// Runs the command `view`, which writes a page that plays a model. Prints the path and the size of the page.
 fn run_view(args: ViewArgs, events: &Events) -> Result<()> {
-    let as_json = args.json;
+    let as_json = args.results.json;
     let found = view::view(&view_options(args, events))?;
-    let value = serde_json::json!({
-        "page": found.page.to_string_lossy(), "frames": found.frames, "bytes": found.bytes, "files": found.files,
-        "notes": found.notes,
-    });
-    print_result(as_json, &value, &found.notes, || page_text(&found) + "\n")
+    print_result(as_json, &found, &found.notes, || page_text(&found) + "\n")
 }
 
 /// Writes the HTML page that plays a model, and shows the notes about it on standard error. Returns a line of text with
@@ -238,8 +235,8 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     let storing = storage_precision(&args);
     let output = (!is_stdout).then_some(path.as_path());
     let has_cache = args.cache_args.cache.is_some();
-    let cameras = Cameras { file: args.cameras, split: args.split };
-    let mut input = input_options(args.input, Some(cameras), output, events);
+    let mut input = input_options(args.input, Some(args.cameras), output, events);
+    input.split = scored_split(args.split);
     input.work = cache_request(args.cache_args);
     let kind = requested_kind(&args.format, &path)?;
     let is_container = !is_stdout && convert::is_container(&path, kind);
@@ -261,21 +258,22 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
         return Ok(());
     }
     let converted = if is_container {
-        let Some(packed) = completed(container::pack(&input, &path, &storing, args.earlier.replace())?)? else {
+        let Some(packed) = completed(container::pack(&input, &path, &storing, replace(args.results.overwrite))?)?
+        else {
             return Ok(());
         };
         packed
     } else {
-        convert::convert(&input, &path, kind, args.earlier.replace())?
+        convert::convert(&input, &path, kind, replace(args.results.overwrite))?
     };
-    print_result(args.json, &converted, &converted.notes, || converted.text())
+    print_result(args.results.json, &converted, &converted.notes, || converted.text())
 }
 
 /// Runs `info`: prints the content of an input, or checks or repairs a container.
 fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
     let path = args.input.input.clone();
     if let Some(output) = args.repair {
-        let report = container::recover(&path, &output, args.earlier.replace())?;
+        let report = container::recover(&path, &output, replace(args.results.overwrite))?;
         let value = serde_json::json!({
             "path": output.to_string_lossy(), "frames": report.frames, "frames_seen": report.frames_seen,
             "tiles": report.tiles_saved,
@@ -287,7 +285,7 @@ fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
             report.frames_seen,
             report.tiles_saved
         );
-        return print_as(args.json, || json_text(&value), || text);
+        return print_as(args.results.json, || json_text(&value), || text);
     }
     if args.check {
         let report = container::verify(&path)?;
@@ -300,10 +298,10 @@ fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
         let path = path.shown();
         let text =
             format!("{path}: no damage; {frames} frames, {tiles} tiles, {stored} bytes that decode to {decoded}\n");
-        return print_as(args.json, || json_text(&value), || text);
+        return print_as(args.results.json, || json_text(&value), || text);
     }
     let info = container::info(&input_options(args.input, None, None, events))?;
-    print_as(args.json, || json_text(&info), || info.text())
+    print_as(args.results.json, || json_text(&info), || info.text())
 }
 
 /// Runs `cache`: lists or removes the entries of a cache folder.
@@ -322,7 +320,7 @@ fn run_cache(args: &CacheFolder) -> Result<()> {
 
 /// Runs the command `demo` and prints its results.
 fn run_demo(args: Demo, events: &Events) -> Result<()> {
-    let as_json = args.json;
+    let as_json = args.results.json;
     let options = demo_options(args, events);
     let found = demo::run(&options)?;
     print_as(as_json, || json_text(&found), || found.text(&options.output))

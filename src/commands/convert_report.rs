@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use crate::error::ShowPath;
+use crate::files::text::serialize_path;
 use crate::outputs::kind::OutputKind;
 use crate::progress::counted;
 
@@ -12,6 +13,7 @@ use crate::progress::counted;
 #[derive(Debug, Serialize)]
 pub struct ConvertReport {
     /// Path of the output.
+    #[serde(serialize_with = "serialize_path")]
     pub path: PathBuf,
     /// Format of the output.
     pub kind: OutputKind,

@@ -2,8 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
+
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
+use crate::files::text::serialize_path;
 use crate::journal::Journal;
 use crate::memory_plan::Workload;
 use crate::outputs::rows::RowTable;
@@ -57,9 +60,10 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
 }
 
 /// Result of the command `score`.
-#[derive(Debug)]
+#[derive(Debug, Serialize)]
 pub struct ScoreReport {
     /// Path of the written file.
+    #[serde(serialize_with = "serialize_path")]
     pub output: PathBuf,
     /// Number of rows of the written file, one per Gaussian.
     pub gaussians: usize,

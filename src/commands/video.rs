@@ -114,8 +114,14 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
 
     let staged = StagedFile::new(output, options.overwrite)?;
     let mut film = FilmOutput::create((staged.path(), output), &format, size, views.len() as u32, options.fps)?;
-    let source =
-        FilmSource { cameras: &cameras, views: &views, limits: &scene.limits, background, events: &scene.events };
+    let source = FilmSource {
+        cameras: &cameras,
+        views: &views,
+        limits: &scene.limits,
+        background,
+        gap: 0,
+        events: &scene.events,
+    };
     match &beside {
         None => source.film([RenderedSource::all_gaussians(scene.source())], &mut film)?,
         Some(other) => source.film([scene.source(), other.source()].map(RenderedSource::all_gaussians), &mut film)?,
@@ -221,25 +227,27 @@ fn common_size(cameras: &[Camera]) -> Result<(u32, u32)> {
 }
 
 /// Cameras, views and settings from which the frames of a video are rendered.
-struct FilmSource<'a> {
-    cameras: &'a [Camera],
-    views: &'a [FrameView],
-    limits: &'a Limits,
-    background: [f32; 3],
-    events: &'a Events,
+pub(crate) struct FilmSource<'a> {
+    pub(crate) cameras: &'a [Camera],
+    pub(crate) views: &'a [FrameView],
+    pub(crate) limits: &'a Limits,
+    pub(crate) background: [f32; 3],
+    /// Width of the white line between the renders of two models, pixels.
+    pub(crate) gap: u32,
+    pub(crate) events: &'a Events,
 }
 
 impl FilmSource<'_> {
     /// Renders each view with every model in `subjects`, joins the renders of a view from left to right, and adds the
     /// joined images to `film` in order.
-    fn film<const S: usize>(&self, subjects: [RenderedSource<'_>; S], film: &mut FilmOutput) -> Result<()> {
+    pub(crate) fn film<const S: usize>(&self, subjects: [RenderedSource<'_>; S], film: &mut FilmOutput) -> Result<()> {
         let progress = self.events.task(NAME, "frames", self.views.len() as u64);
         for_each_view_batch(subjects, self.cameras, self.views, BatchLimits::one_frame(self.limits), |views| {
             let images: Vec<Image> = views
                 .par_iter()
                 .map(|view: &RenderableView<'_, S>| {
                     let renders = (0..S).into_par_iter().map(|subject| view.render(subject, self.background));
-                    side_by_side(renders.collect())
+                    side_by_side(renders.collect(), self.gap)
                 })
                 .collect();
             images.iter().try_for_each(|image| {
@@ -250,18 +258,23 @@ impl FilmSource<'_> {
     }
 }
 
-/// Joins images of the same size from left to right, and returns the joined image.
-fn side_by_side(mut images: Vec<Image>) -> Image {
-    if images.len() == 1 {
-        return images.swap_remove(0);
-    }
+/// Joins images of the same size from left to right, with a white line of `gap` pixels between two images, and returns
+/// the joined image.
+fn side_by_side(images: Vec<Image>, gap: u32) -> Image {
     let (width, height) = images.first().map_or((0, 0), |image| (image.width, image.height));
-    let row = |y: usize| {
-        let values = 3 * width as usize;
-        images.iter().flat_map(move |image| image.data[y * values..(y + 1) * values].iter().copied())
-    };
-    let data = (0..height as usize).flat_map(row).collect();
-    Image { width: width * images.len() as u32, height, data }
+    let line = vec![1.0; 3 * gap as usize];
+    let mut data = Vec::new();
+    for y in 0..height as usize {
+        for (k, image) in images.iter().enumerate() {
+            if k > 0 {
+                data.extend_from_slice(&line);
+            }
+            let row = 3 * width as usize;
+            data.extend_from_slice(&image.data[y * row..(y + 1) * row]);
+        }
+    }
+    let count = images.len() as u32;
+    Image { width: width * count + gap * count.saturating_sub(1), height, data }
 }
 
 /// Returns a line of text that says which of two models a video shows on the left and which on the right.

@@ -5,9 +5,9 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use rayon::prelude::*;
 use serde::Serialize;
 
+use crate::commands::video::FilmSource;
 use crate::diagnostics::demo_scene::Playground;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::EvaluateOptions;
@@ -19,15 +19,15 @@ use crate::model::{Camera, FrameView, Rig, Split};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::outputs::kind::{OutputKind, check_folder_name};
-use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch};
+use crate::passes::RenderedSource;
 use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
 use crate::player::view::{ViewOptions, view};
 use crate::progress::Events;
 use crate::recipe::{Effort, Recipe};
-use crate::render::Image;
 use crate::report::{self, ReportOptions};
 use crate::scene::view_selection::ViewSet;
 use crate::scene::{InputOptions, Scene};
+use crate::source::FrameSource;
 
 /// File name of the generated scene.
 pub const SCENE_FILE: &str = "scene.gseq";
@@ -232,30 +232,17 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
     let [scene, pruned, refined] = models;
     let (scene, pruned, refined) = (scene?, pruned?, refined?);
     let camera = smaller(&rig.cameras[FILM_VIEW as usize]);
-    let frames = crate::source::FrameSource::info(&scene).times.len();
+    let frames = scene.info().times.len();
     let step = frames.div_ceil(FILM_FRAMES).max(1);
     let view = |frame| FrameView { frame, view: FILM_VIEW, camera: 0 };
     let views: Vec<FrameView> = (0..frames).step_by(step).map(view).collect();
     let path = folder.join(FILM_FILE);
     let size = (3 * FILM_RENDER.0 + 2 * FILM_GAP, FILM_RENDER.1);
     let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, views.len() as u32, FILM_RATE)?;
-    let progress = events.task("film", "frames", views.len() as u64);
-    let subjects = [
-        RenderedSource::all_gaussians(&scene),
-        RenderedSource::all_gaussians(&pruned),
-        RenderedSource::all_gaussians(&refined),
-    ];
-    for_each_view_batch(subjects, &[camera], &views, BatchLimits::one_frame(limits), |batch| {
-        let render = |view: &RenderableView<'_, 3>| {
-            let black = rig.background.unwrap_or_default();
-            beside([0, 1, 2].map(|subject| view.render(subject, black)))
-        };
-        let images: Vec<Image> = batch.par_iter().map(render).collect();
-        images.iter().try_for_each(|image| {
-            progress.advance(1);
-            film.add_frame(image)
-        })
-    })?;
+    let background = rig.background.unwrap_or_default();
+    let source = FilmSource { cameras: &[camera], views: &views, limits, background, gap: FILM_GAP, events };
+    let models: [&dyn FrameSource; 3] = [&scene, &pruned, &refined];
+    source.film(models.map(RenderedSource::all_gaussians), &mut film)?;
     film.finish()
 }
 
@@ -273,24 +260,6 @@ fn smaller(camera: &Camera) -> Camera {
         cy: 0.5 * f64::from(height),
         ..camera.clone()
     }
-}
-
-/// Joins three renders of equal size from left to right, with a white line between neighboring renders, and returns the
-/// joined image.
-fn beside(images: [Image; 3]) -> Image {
-    let (width, height) = (images[0].width, images[0].height);
-    let line = vec![1.0; 3 * FILM_GAP as usize];
-    let mut data = Vec::new();
-    for y in 0..height as usize {
-        for (k, image) in images.iter().enumerate() {
-            let row = 3 * width as usize;
-            data.extend_from_slice(&image.data[y * row..(y + 1) * row]);
-            if k < 2 {
-                data.extend_from_slice(&line);
-            }
-        }
-    }
-    Image { width: 3 * width + 2 * FILM_GAP, height, data }
 }
 
 impl DemoReport {

@@ -237,6 +237,7 @@ impl ModelPair {
         Ok(())
     }
 
+    /// Renders and compares all views, and returns the evaluation:
     /// - A run that is limited to one shard stores the quality measures of its views and ends with
     ///   [`Error::ShardDone`].
     /// - A run without such a limit computes the missing shards and joins the quality measures of all shards.
@@ -249,8 +250,10 @@ impl ModelPair {
         Ok(evaluation)
     }
 
-    /// - If the cache has the quality measures of all shards, it returns the evaluation, so that the run can go on to
-    /// - If the cache lacks some, it ends with [`Error::ShardDone`] after it has stored the quality measures of its own
+    /// Compares all views as the first stage of a longer run, which may be limited to one shard:
+    /// - If the cache has the quality measures of all shards, returns the evaluation, so that the run can go on to its
+    ///   next stage.
+    /// - If the cache lacks some, ends with [`Error::ShardDone`] after it has stored the quality measures of its own
     ///   shard.
     ///
     /// # Errors
@@ -287,17 +290,11 @@ impl ModelPair {
     ) -> Result<Vec<O>> {
         self.compute_sharded(name, |range| {
             let progress = self.scene.events.task(name, "views", range.len() as u64);
-            let mut values = Vec::with_capacity(range.len());
-            self.for_each_batch(&self.views[range], |views| {
-                let observe_view = |view: &RenderableView<'_, 2>| {
-                    let value = observe(view.states[0], view.camera, &self.render_view(view)?);
-                    progress.advance(1);
-                    Ok(value)
-                };
-                values.extend(views.par_iter().map(observe_view).collect::<Result<Vec<O>>>()?);
-                Ok(())
-            })?;
-            Ok(values)
+            self.map_views(&self.views[range], |view| {
+                let value = observe(view.states[0], view.camera, &self.render_view(view)?);
+                progress.advance(1);
+                Ok(value)
+            })
         })
     }
 
@@ -308,14 +305,8 @@ impl ModelPair {
         name: &str,
         compute: impl Fn(Range<usize>) -> Result<Vec<T>>,
     ) -> Result<Vec<T>> {
-        let work = &self.scene.work;
-        let key = self.key()?;
-        work.compute_in_shards(name, key, self.views.len(), compute, |parts| {
-            let mut values = Vec::with_capacity(self.views.len());
-            for part in parts {
-                values.extend(part?);
-            }
-            Ok(values)
+        self.scene.work.compute_in_shards(name, self.key()?, self.views.len(), compute, |parts| {
+            Ok(parts.collect::<Result<Vec<Vec<T>>>>()?.into_iter().flatten().collect())
         })
     }
 
@@ -436,16 +427,10 @@ impl ModelPair {
         views: &[FrameView],
         observe: impl Fn([&Image; 2]) -> Result<O> + Sync,
     ) -> Result<Vec<O>> {
-        let mut values = Vec::with_capacity(views.len());
-        self.for_each_batch(views, |batch| {
-            let compare_view = |view: &RenderableView<'_, 2>| {
-                let images = [0, 1].map(|subject| view.render(subject, self.background));
-                observe([&images[0], &images[1]])
-            };
-            values.extend(batch.par_iter().map(compare_view).collect::<Result<Vec<O>>>()?);
-            Ok(())
-        })?;
-        Ok(values)
+        self.map_views(views, |view| {
+            let images = [0, 1].map(|subject| view.render(subject, self.background));
+            observe([&images[0], &images[1]])
+        })
     }
 
     /// Measures and returns the median time of rendering one view with each model, milliseconds. The times differ
@@ -460,6 +445,20 @@ impl ModelPair {
     /// Returns the number of Gaussians of the compressed model.
     pub fn compressed_count(&self) -> usize {
         self.compressed.source().info().count
+    }
+
+    /// Calls `visit` for each of `views`, from any thread, and returns its values in the order of the views.
+    fn map_views<O: Send>(
+        &self,
+        views: &[FrameView],
+        visit: impl Fn(&RenderableView<'_, 2>) -> Result<O> + Sync,
+    ) -> Result<Vec<O>> {
+        let mut values = Vec::with_capacity(views.len());
+        self.for_each_batch(views, |batch| {
+            values.extend(batch.par_iter().map(&visit).collect::<Result<Vec<O>>>()?);
+            Ok(())
+        })?;
+        Ok(values)
     }
 
     /// Calls `visit` for all `views`, in order, with a batch of views at a time. For each view of a batch, `visit` gets

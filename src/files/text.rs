@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
@@ -17,6 +17,14 @@ pub fn json_text(value: &impl Serialize) -> String {
     let mut text = serde_json::to_string_pretty(value).expect("plain data");
     text.push('\n');
     text
+}
+
+/// Serializes a path as text. Bytes that are not UTF-8 become replacement characters, as in messages.
+///
+/// # Errors
+/// Fails if the serializer fails.
+pub fn serialize_path<S: Serializer>(path: &Path, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    serializer.serialize_str(&path.to_string_lossy())
 }
 
 /// Reads the text file at `path`, which may have at most `most_bytes` bytes, and removes a byte order mark.

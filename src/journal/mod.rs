@@ -13,9 +13,9 @@ use serde::{Deserialize, Serialize};
 use crate::cache::{Cache, CacheKey, Spill};
 use crate::error::Result;
 use crate::journal::as_toml::AsToml;
-use crate::journal::records::Forecast;
 use crate::journal::records::{
-    FieldPrecisionSummary, OmittedWork, PhotographSummary, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord,
+    FieldPrecisionSummary, Forecast, OmittedWork, PhotographSummary, RefinedSummary, SavedCost, ShDegreeSummary,
+    StageRecord,
 };
 use crate::machine::peak_memory_bytes;
 use crate::progress::{Events, Message};

@@ -271,7 +271,7 @@ pub struct Forecast {
     pub core_seconds: EstimateRange,
     /// Number of threads that the run uses.
     pub threads: u64,
-    /// Whether this forecast uses the speed of this machine, measured on the scene.
+    /// Whether this forecast uses the measured speed of this machine. Always false.
     pub measured: bool,
     /// Expected peak memory of the process by the memory plan, bytes.
     pub memory_bytes: u64,

@@ -37,9 +37,3 @@ impl ResourceEstimate {
 pub fn bytes_of_survivors(fraction: f64, bytes: u64) -> u64 {
     (fraction * bytes as f64).ceil() as u64
 }
-
-/// Returns the name of each stage in `estimates` and its estimated wall-clock time in seconds, assuming that all
-/// threads of `work` share the work evenly.
-pub fn stage_seconds(work: &Workload, estimates: &[ResourceEstimate]) -> Vec<(&'static str, f64)> {
-    estimates.iter().map(|estimate| (estimate.stage, estimate.seconds / work.threads as f64)).collect()
-}

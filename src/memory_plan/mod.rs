@@ -17,9 +17,8 @@ mod plan;
 mod workload;
 
 pub use budget::{Budget, Verbosity, format_bytes, peak_memory_text};
-pub use estimate::{ResourceEstimate, bytes_of_survivors, stage_seconds};
+pub use estimate::{ResourceEstimate, bytes_of_survivors};
 pub use plan::MemoryPlan;
 pub use workload::{
-    CONTRIBUTION_COST, MemoryPart, REMOVAL_COST, RENDER_COST, RenderCost, SHARED_VIEW_BYTES_PER_GAUSSIAN, Throughput,
-    Workload,
+    CONTRIBUTION_COST, MemoryPart, REMOVAL_COST, RENDER_COST, RenderCost, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload,
 };

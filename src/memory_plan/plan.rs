@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::budget::{Budget, PER_THREAD, PROGRAM_BYTES, Verbosity, format_bytes};
-use super::estimate::{ResourceEstimate, stage_seconds};
+use super::estimate::ResourceEstimate;
 use super::workload::{MemoryPart, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
@@ -244,10 +244,11 @@ impl MemoryPlan {
     /// Sends the estimated time of each stage to `events` if `tell` asks for the whole plan ([`Verbosity::Plan`]).
     pub fn send_stage_times(&self, tell: Verbosity, events: &Events) {
         if tell == Verbosity::Plan {
-            let stages = stage_seconds(&self.work, &self.estimates);
-            let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
-            let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", format_duration(*seconds)));
-            let text = format!("time: about {} ({})", format_duration(whole), named.collect::<Vec<_>>().join(" + "));
+            // All threads share the work.
+            let duration = |core_seconds: f64| format_duration(core_seconds / self.work.threads as f64);
+            let whole = duration(self.estimates.iter().map(|estimate| estimate.seconds).sum());
+            let stages = self.estimates.iter().map(|stage| format!("{} {}", duration(stage.seconds), stage.stage));
+            let text = format!("time: about {whole} ({})", stages.collect::<Vec<_>>().join(" + "));
             events.send(Message::Plan(&text));
         }
     }

@@ -60,8 +60,6 @@ pub struct Workload {
     pub rig: u64,
     /// Number of threads that share the work.
     pub threads: u64,
-    /// Speed of this machine for this input when the work is shared by `threads` threads.
-    pub throughput: Throughput,
 }
 
 impl Workload {
@@ -80,7 +78,6 @@ impl Workload {
             frame_views: 0,
             rig: 0,
             threads: rayon::current_num_threads() as u64,
-            throughput: Throughput::UNKNOWN,
         }
     }
 
@@ -253,8 +250,8 @@ impl Workload {
 
     /// Returns the time in seconds on one processor core for rendering `views` views of `gaussians` Gaussians. The last
     /// argument, a [`RenderCost`], gives the time of one view per Gaussian and per pixel.
-    pub fn render_seconds(&self, views: f64, gaussians: f64, RenderCost { gaussian, pixel, pace }: RenderCost) -> f64 {
-        pace(&self.throughput) * views * (gaussians * gaussian + self.pixels as f64 * pixel)
+    pub fn render_seconds(&self, views: f64, gaussians: f64, RenderCost { gaussian, pixel }: RenderCost) -> f64 {
+        views * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
     /// Returns a copy of this workload for renders of only every `stride`-th pixel in each direction, with the number
@@ -266,7 +263,7 @@ impl Workload {
     /// Returns the time in seconds on one processor core for reading the states of `gaussians` Gaussians at `frames`
     /// frames each.
     pub fn reading_seconds(&self, gaussians: f64, frames: f64) -> f64 {
-        self.throughput.states * gaussians * frames * self.input.seconds_per_state
+        gaussians * frames * self.input.seconds_per_state
     }
 
     /// Returns the number of Gaussians N as a floating-point number, for estimates of stages that process a fraction of
@@ -295,31 +292,6 @@ impl Workload {
     }
 }
 
-/// Speed of this machine for a scene: measured times divided by the times that this module assumes. Each ratio is 1 if
-/// nothing was measured; a ratio above 1 means that the machine is slower than assumed.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Throughput {
-    /// Time for reading the states of Gaussians at a frame and processing them, as a multiple of the time that
-    /// [`MemoryProfile::seconds_per_state`] gives.
-    pub states: f64,
-    /// Time for finding the contributions of the Gaussians to a view, as a multiple of the time that
-    /// [`CONTRIBUTION_COST`] assumes.
-    pub contribution_time: f64,
-    /// Time for finding removal errors in a view, as a multiple of the time that [`REMOVAL_COST`] assumes.
-    pub removal_time: f64,
-    /// Time for rendering and comparing a view, as a multiple of the time that [`RENDER_COST`] assumes.
-    pub render_time: f64,
-    /// Mean number of processor cores that were available to this process during the measurement; `None` if nothing was
-    /// measured.
-    pub processors: Option<f64>,
-}
-
-impl Throughput {
-    /// Speed that is assumed if nothing was measured.
-    pub const UNKNOWN: Throughput =
-        Throughput { states: 1.0, contribution_time: 1.0, removal_time: 1.0, render_time: 1.0, processors: None };
-}
-
 /// Time for rendering one view for a certain purpose, such as finding contributions: a time per Gaussian plus a time
 /// per pixel.
 #[derive(Debug, Clone, Copy)]
@@ -328,21 +300,17 @@ pub struct RenderCost {
     gaussian: f64,
     /// Time for rendering one view, per pixel of the image, in seconds on one processor core.
     pixel: f64,
-    /// Function that returns a factor, by which both times are multiplied: the measured time of this kind of rendering
-    /// divided by the assumed time, for example [`Throughput::render_time`].
-    pace: fn(&Throughput) -> f64,
 }
 
 /// Time for finding the contribution (Σ alpha · transmittance) of every Gaussian to one view. [`CONTRIBUTION_COST`],
 /// [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models; `scripts/estimate.py` compares
 /// estimated with measured times.
-pub const CONTRIBUTION_COST: RenderCost =
-    RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.contribution_time };
+pub const CONTRIBUTION_COST: RenderCost = RenderCost { gaussian: 1.6e-7, pixel: 5e-9 };
 /// Time for finding the removal error of every Gaussian in one view: the squared error that removing this Gaussian
 /// alone would cause.
-pub const REMOVAL_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.removal_time };
+pub const REMOVAL_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8 };
 /// Time for rendering one view and comparing the render with another one.
-pub const RENDER_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render_time };
+pub const RENDER_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8 };
 
 /// Returns the bytes of memory that zstd takes for its tables for finding matches, at the compression level `level`,
 /// for an input of `bytes` bytes. There are two tables of 4-byte entries. Each has at most 2n entries, where n is

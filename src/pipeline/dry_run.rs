@@ -1,5 +1,4 @@
-//! Dry run: reports what a run would do, how long it would take and what it would write. Only opens the input and
-//! measures the speed of this machine for a short time.
+//! Dry run: reports what a run would do, how long it would take and what it would write. Only opens the input.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -17,9 +16,7 @@ use crate::memory_plan::{MemoryPlan, Verbosity, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
-use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::stages::write::companion_names;
-use crate::pipeline::throughput::forecast;
 use crate::progress::counted;
 use crate::scene::{InputOptions, open_scene};
 
@@ -64,8 +61,7 @@ pub struct DryRunReport {
     pub notes: Vec<String>,
 }
 
-/// Returns the report of a dry run of `request`. Opens the input and renders a few views to measure the speed of this
-/// machine for the time estimates.
+/// Returns the report of a dry run of `request`. Only opens the input.
 ///
 /// # Errors
 /// Fails for every reason for which a run would fail before its first stage. Also fails for a stream, whose size is
@@ -86,7 +82,8 @@ pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     let needs = |work: &Workload, limits: &_| run.estimates(work, limits);
     let plan = MemoryPlan::fit_budget(scene.workload(), input.memory, &input.events, needs)?;
     scene.apply_plan(&plan);
-    let forecast = forecast(&mut scene, &plan, &run, MeasuredOnArrival::default())?;
+    let work = scene.workload();
+    let forecast = Forecast::new(&work, &run.estimates(&work, &scene.limits), plan.peak_bytes());
     let mut journal = Journal::default();
     run.stages.record_left_out(&scene.workload(), &scene.limits, &mut journal);
     let info = scene.source().info();

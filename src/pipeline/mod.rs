@@ -16,7 +16,6 @@ pub(crate) mod stage;
 pub mod stages;
 pub mod summary;
 mod summary_text;
-pub(crate) mod throughput;
 pub mod time_estimate;
 
 pub use dry_run::dry_run;
@@ -30,7 +29,7 @@ use crate::cache::Completion;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
-use crate::memory_plan::{Budget, Verbosity, Workload, stage_seconds};
+use crate::memory_plan::{Budget, Verbosity, Workload};
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
@@ -145,8 +144,8 @@ fn run_stages(
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.full_read()?;
     let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default());
-    let _numbered =
-        scene.events.begin_run(&stage_seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
+    let expected = plan.remaining_estimates(&work, &scene.limits, measured);
+    let _numbered = scene.events.begin_run(&expected.iter().map(|stage| stage.stage).collect::<Vec<_>>());
     let input = InputSummary::from_scene(scene)?.without_folder_paths();
     let recipe = recipe_text(&input.digest, plan, request, &mut journal);
     let output = plan.output.as_ref().map(|output| output.kind);

@@ -18,6 +18,7 @@ use glam::DVec3;
 use crate::error::Result;
 use crate::files::cameras;
 use crate::files::frame_stream::FrameStream;
+use crate::journal::records::Forecast;
 use crate::journal::{Journal, Stopwatch};
 use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload, format_bytes};
 use crate::model::RobustBox;
@@ -30,7 +31,6 @@ use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::{Measured, MeasuredOnArrival};
 use crate::pipeline::stages::measure::MeasureStages;
 use crate::pipeline::stages::{quality, track};
-use crate::pipeline::throughput::forecast;
 use crate::progress::Message;
 use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
@@ -91,10 +91,8 @@ pub fn open_to_measure(
         stages.estimates(work, limits)
     })?;
     scene.apply_plan(&plan);
-    // Reads of the calibration of the time forecast are not part of the memory plan, so reads are counted before it.
-    let reads = scene.source().reads();
-    send_forecast(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
-    journal.record_opening("read", start, scene.source().info().count, reads);
+    send_forecast(&scene, &plan, &stages, MeasuredOnArrival::default(), options, journal);
+    journal.record_opening("read", start, scene.source().info().count, scene.source().reads());
     Ok((scene, stages, None))
 }
 
@@ -113,13 +111,13 @@ fn warn_of_virtual_views(scene: &Scene) {
 /// - `plan`: memory plan; `stages`: plan of the run.
 /// - `measured`: kinds of statistics that were already computed while the input, a stream, arrived.
 fn send_forecast(
-    scene: &mut Scene,
+    scene: &Scene,
     plan: &MemoryPlan,
     stages: &RunPlan,
     measured: MeasuredOnArrival,
     options: &InputOptions,
     journal: &mut Journal,
-) -> Result<()> {
+) {
     let tell = options.memory.tell;
     // A process that runs only one shard does not know which fraction of the whole run it does, so it has no forecast.
     let is_part = options.work.as_ref().is_some_and(|work| work.shard.is_some());
@@ -127,11 +125,12 @@ fn send_forecast(
         options.events.send(Message::Plan(&stages.text()));
     }
     if tell != Verbosity::Nothing && !is_part {
-        let forecast = forecast(scene, plan, stages, measured)?;
+        let work = scene.workload();
+        let estimates = stages.remaining_estimates(&work, &scene.limits, measured);
+        let forecast = Forecast::new(&work, &estimates, plan.peak_bytes());
         options.events.send(Message::Plan(forecast.text(tell).trim_end()));
         journal.forecast = Some(forecast);
     }
-    Ok(())
 }
 
 /// Receives a stream, packs its frames into a scratch container, and opens the container as a scene. If memory
@@ -230,7 +229,7 @@ fn receive_measured(
         None => None,
     };
     let measured = arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default();
-    send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
+    send_forecast(&scene, &later, &stages, measured, options, journal);
     Ok((scene, stages, arrived))
 }
 

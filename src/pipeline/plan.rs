@@ -233,21 +233,6 @@ impl RunPlan {
         self.estimates_where(input, |stage| !stage.is_optional())
     }
 
-    /// Returns the resource estimates (memory, time, reads) of the stages that certainly have to run. A run that
-    /// removes only Gaussians that hardly change renders does not need all stages; the stages that may be unnecessary
-    /// are left out. `hardly_seen`: fraction of the Gaussians that can be removed before the PSNR of renders falls
-    /// below 60 dB.
-    pub fn shortest_estimates(
-        &self,
-        work: &Workload,
-        limits: &Limits,
-        measured: MeasuredOnArrival,
-        hardly_seen: f64,
-    ) -> Vec<ResourceEstimate> {
-        let input = self.estimate_input(work, limits, measured);
-        self.estimates_where(input, |stage| !stage.may_be_skipped(input, hardly_seen))
-    }
-
     fn estimate_input<'a>(
         &self,
         work: &'a Workload,
@@ -267,11 +252,6 @@ impl RunPlan {
             None => phase_estimates(Phase::Reduce),
         };
         [phase_estimates(Phase::Rank), reduce, phase_estimates(Phase::Write)].concat()
-    }
-
-    /// Returns whether the amount of work depends on intermediate results, so that the time of the run is less certain.
-    pub fn has_uncertain_duration(&self) -> bool {
-        self.search.is_some() || self.stages.has_uncertain_duration()
     }
 
     /// Returns one line of text for each divisible stage (a stage whose work several processes can share). A line holds

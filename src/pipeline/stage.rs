@@ -71,13 +71,6 @@ pub trait Stage: Debug + Send + Sync {
         String::new()
     }
 
-    /// Returns whether the stage may turn out to be unnecessary, because the run removes only Gaussians that hardly
-    /// change renders. The lower bound of the estimated time of a run does not count such stages. `_hardly_seen`:
-    /// fraction of the Gaussians that can be removed before the PSNR of renders falls below 60 dB.
-    fn may_be_skipped(&self, _input: EstimateInput<'_>, _hardly_seen: f64) -> bool {
-        false
-    }
-
     /// Returns whether the stage is optional: it only reports something, such as the quality of the result, and a run
     /// without enough memory for the stage omits it.
     fn is_optional(&self) -> bool {
@@ -239,8 +232,6 @@ pub struct StageList {
     left_out: Vec<LeftOutStage>,
     /// Plan of how many Gaussians ranking and refinement leave.
     pub counts: CountPlan,
-    /// Whether the amount of work depends on intermediate results, so that the time of the run is less certain.
-    has_uncertain_duration: bool,
 }
 
 impl StageList {
@@ -269,16 +260,6 @@ impl StageList {
     /// Removes the optional stages, which only report something (see [`Stage::is_optional`]).
     pub fn remove_optional(&mut self) {
         self.stages.retain(|(_, stage)| !stage.is_optional());
-    }
-
-    /// Records that the amount of work depends on intermediate results, so that the time of the run is less certain.
-    pub fn set_uncertain_duration(&mut self) {
-        self.has_uncertain_duration = true;
-    }
-
-    /// Returns whether the amount of work depends on intermediate results, so that the time of the run is less certain.
-    pub fn has_uncertain_duration(&self) -> bool {
-        self.has_uncertain_duration
     }
 
     /// Returns all stages in the order in which they run.

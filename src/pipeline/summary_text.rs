@@ -3,15 +3,13 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use bytesize::ByteSize;
-
 use super::summary::{Summary, SummaryDetail};
 use crate::error::ShowPath;
 use crate::journal::records::{PhotographSummary, QualitySummary, ShDegreeSummary, ViewKind};
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::models::ModelSize;
 use crate::outputs::kind::OutputKind;
-use crate::progress::{counted, format_duration};
+use crate::progress::{counted, decimal_bytes, format_duration, grouped};
 use crate::refinement::photographs::FIT;
 
 /// Maximum number of notes that the text of a summary shows unless all details are requested.
@@ -97,7 +95,7 @@ impl Summary {
         let (all, kept) = (self.input.gaussians as u64, self.gaussians as u64);
         row(out, "Gaussians", &grouped(all), &grouped(kept), &times(all, kept, "fewer"))?;
         let (before, after) = (self.input.bytes, self.output_bytes);
-        row(out, "Size", &bytes(before), &bytes(after), &times(before, after, "smaller"))?;
+        row(out, "Size", &decimal_bytes(before), &decimal_bytes(after), &times(before, after, "smaller"))?;
         self.write_size_parts(out)?;
         if let Some(time) = self.quality.and_then(|quality| quality.render_ms) {
             let [before, after] = [time.before, time.after].map(|ms| format!("{ms:.1} ms"));
@@ -161,7 +159,13 @@ impl Summary {
                 continue;
             }
             let is_most = after == largest && 2 * after > self.output_bytes && name != "  Gaussians";
-            row(out, name, &bytes(before), &bytes(after), if is_most { "← most of what is left" } else { "" })?;
+            row(
+                out,
+                name,
+                &decimal_bytes(before),
+                &decimal_bytes(after),
+                if is_most { "← most of what is left" } else { "" },
+            )?;
         }
         Ok(())
     }
@@ -270,29 +274,9 @@ fn times(before: u64, after: u64, word: &str) -> String {
     }
 }
 
-/// Formats a number of bytes with a decimal unit, such as "1.5 MB".
-fn bytes(bytes: u64) -> String {
-    ByteSize(bytes).display().si().to_string()
-}
-
-/// Formats a number with a comma between groups of three digits.
-fn grouped(number: u64) -> String {
-    let digits = number.to_string();
-    let groups: Vec<&str> =
-        digits.as_bytes().rchunks(3).rev().filter_map(|group| std::str::from_utf8(group).ok()).collect();
-    groups.join(",")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn numbers_are_grouped_by_three_digits() {
-        for (number, text) in [(0, "0"), (999, "999"), (20883, "20,883"), (1_234_567, "1,234,567")] {
-            assert_eq!(grouped(number), text);
-        }
-    }
 
     #[test]
     fn paths_are_words_of_the_shell() {

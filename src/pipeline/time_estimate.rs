@@ -6,57 +6,26 @@ use crate::journal::records::{EstimateRange, Forecast, StageForecast};
 use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, format_bytes};
 use crate::progress::{counted, format_duration};
 
-/// Lowest and highest ratio of measured to estimated core-seconds of runs after a calibration, found on three trained
-/// models at several sizes (`scripts/estimate.py`) and slightly widened.
-const ERROR_RANGE: [f64; 2] = [0.5, 1.6];
-/// Lowest and highest ratio of measured to estimated core-seconds of runs without a calibration.
-const ERROR_RANGE_UNCALIBRATED: [f64; 2] = [0.25, 4.0];
-/// Lowest and highest ratio of measured to estimated core-seconds of runs whose amount of work depends on intermediate
-/// results. An example is a search for a requested quality: how many models it refines is not known in advance.
-const ERROR_RANGE_SEARCH: [f64; 2] = [0.15, 2.5];
-/// Minimum fraction of the processors that the stages of a run keep busy on average. It is below 1 because some work is
-/// not divided among threads.
-const MIN_UTILIZATION: f64 = 0.6;
-/// Time that every run takes to start, to open its input and to write its output, seconds.
-const FIXED_SECONDS: f64 = 0.5;
+/// Lowest and highest ratio of actual to estimated time. The range covers machines of different speed, and runs whose
+/// amount of work depends on intermediate results: a search for a quality repeats stages, and refinement is skipped if
+/// renders are close enough without it.
+const ERROR_RANGE: [f64; 2] = [0.15, 4.0];
+/// Fraction of the processors that the stages of a run keep busy on average. It is below 1 because some work is not
+/// divided among threads.
+const UTILIZATION: f64 = 0.9;
 
 impl Forecast {
     /// Returns the forecast (expected time and memory) of a run. `work`: sizes of its input and views. `needs`:
-    /// resource estimates of its stages. `least`: estimated core-seconds without the stages that may turn out to be
-    /// unnecessary; the expected time is the geometric mean of the times with and without them. `searches`: whether the amount of work depends on intermediate results. `memory_bytes`: maximum
-    /// memory.
-    pub(super) fn new(
-        work: &Workload,
-        needs: &[ResourceEstimate],
-        least: f64,
-        searches: bool,
-        memory_bytes: u64,
-    ) -> Forecast {
-        // Stages that may turn out to be unnecessary take either their whole time or none. The geometric mean differs
-        // from both times by the same factor.
-        let all_stages = core_seconds(needs);
-        let likely = (least * all_stages).sqrt();
-        let measured = work.throughput.processors;
-        let error_range = match (searches, measured) {
-            (true, _) => ERROR_RANGE_SEARCH,
-            (_, Some(_)) => ERROR_RANGE,
-            (_, None) => ERROR_RANGE_UNCALIBRATED,
-        };
-        let core =
-            EstimateRange { least: error_range[0] * least, likely, most: error_range[1] * all_stages + FIXED_SECONDS };
-        let threads = work.threads as f64;
-        let processors = measured.unwrap_or(threads).min(threads);
-        let usual = (0.9 * processors).max(1f64.min(processors));
-        let fewest = (MIN_UTILIZATION * processors).max(1f64.min(processors));
+    /// resource estimates of its stages. `memory_bytes`: maximum memory.
+    pub(super) fn new(work: &Workload, needs: &[ResourceEstimate], memory_bytes: u64) -> Forecast {
+        let core_seconds: f64 = needs.iter().map(|need| need.seconds).sum();
+        let range =
+            |likely: f64| EstimateRange { least: ERROR_RANGE[0] * likely, likely, most: ERROR_RANGE[1] * likely };
         Forecast {
-            seconds: EstimateRange {
-                least: core.least / threads,
-                likely: core.likely / usual,
-                most: core.most / fewest,
-            },
-            core_seconds: core,
+            seconds: range(core_seconds / (UTILIZATION * work.threads as f64).max(1.0)),
+            core_seconds: range(core_seconds),
             threads: work.threads,
-            measured: measured.is_some(),
+            measured: false,
             memory_bytes,
             stages: needs
                 .iter()
@@ -93,11 +62,6 @@ impl Forecast {
     }
 }
 
-/// Returns the sum of the estimated core-seconds of the stages `needs`.
-pub(super) fn core_seconds(needs: &[ResourceEstimate]) -> f64 {
-    needs.iter().map(|need| need.seconds).sum()
-}
-
 /// Formats `value` with two significant digits; more would suggest a precision that a forecast does not have.
 fn two_digits(value: f64) -> String {
     match value {
@@ -122,7 +86,6 @@ fn approximate_time(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::memory_plan::Throughput;
     use crate::pipeline::tests::work;
 
     fn need(seconds: f64) -> ResourceEstimate {
@@ -130,27 +93,16 @@ mod tests {
     }
 
     #[test]
-    fn range_contains_expected_value_and_widens_if_uncertain() {
-        let unmeasured = work(1000);
-        let measured = crate::memory_plan::Workload {
-            throughput: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN },
-            ..unmeasured
-        };
-        let forecast = |work: &Workload, searches| Forecast::new(work, &[need(40.0)], 40.0, searches, 1 << 20);
-        let all = [forecast(&measured, false), forecast(&unmeasured, false), forecast(&measured, true)];
-        for Forecast { seconds, core_seconds, .. } in &all {
-            for range in [seconds, core_seconds] {
-                assert!(range.least < range.likely && range.likely < range.most, "{range:?}");
-            }
+    fn range_contains_the_expected_value_and_text_names_stages_on_request() {
+        let forecast = Forecast::new(&work(1000), &[need(40.0)], 1 << 20);
+        for range in [forecast.seconds, forecast.core_seconds] {
+            assert!(range.least < range.likely && range.likely < range.most, "{range:?}");
         }
-        let may_skip = Forecast::new(&measured, &[need(40.0)], 10.0, false, 1 << 20).core_seconds;
-        assert_eq!((may_skip.likely, may_skip.most), (20.0, all[0].core_seconds.most));
-        let width = |forecast: &Forecast| forecast.core_seconds.most / forecast.core_seconds.least;
-        assert!(width(&all[0]) < width(&all[1]) && width(&all[0]) < width(&all[2]));
-        let text = all[0].text(Verbosity::Plan);
+        assert_eq!(forecast.core_seconds.likely, 40.0);
+        let text = forecast.text(Verbosity::Plan);
         assert!(text.starts_with("time: about ") && text.contains(" core-seconds\n"), "{text}");
         assert!(text.contains("\ncore-seconds: scan 40.0\n") && text.ends_with("memory: at most 1.0 MiB\n"), "{text}");
-        assert!(!all[0].text(Verbosity::Time).contains("scan"));
+        assert!(!forecast.text(Verbosity::Time).contains("scan"));
     }
 
     #[test]

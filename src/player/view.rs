@@ -2,9 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
+
 use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, StagedFile, StagedFolder, TargetKind, check_target, write_summary};
+use crate::files::text::serialize_path;
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT};
@@ -46,9 +49,10 @@ pub struct ViewOptions {
 }
 
 /// Result of the command `view`.
-#[derive(Debug)]
+#[derive(Debug, Serialize)]
 pub struct ViewReport {
     /// Path of the page to open in a browser.
+    #[serde(serialize_with = "serialize_path")]
     pub page: PathBuf,
     /// Size of all written files in bytes.
     pub bytes: u64,

@@ -130,86 +130,83 @@ impl Recipe {
     /// Checks that every parameter is within its range. Otherwise fails with a message that names the first parameter
     /// that is out of range.
     pub fn validate(&self) -> std::result::Result<(), String> {
-        let in_unit = |x: f64| (0.0..=1.0).contains(&x);
-        let nonnegative = |x: f64| x >= 0.0;
-        let finite = |x: f64| x.is_finite() && x >= 0.0;
-        // The limit 1e6 keeps weighted sums finite, so that a weight of 0 gives 0 and not NaN.
-        let weight = |x: f64| (0.0..=1e6).contains(&x);
-        let MergeParams { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } =
-            self.merge;
-        let RefineParams { refine_steps, refine_steps_per_prune: steps_per_prune, refine_keyframes, .. } = self.refine;
-        let archive_steps = self.refine.refine_archive_steps;
-        let mut checks = vec![
-            ("scan.alpha_min", self.scan.alpha_min, in_unit(self.scan.alpha_min), "0 to 1"),
-            ("scan.outside", self.scan.outside, in_unit(self.scan.outside), "0 to 1"),
-            ("score.w_static", self.score.w_static, weight(self.score.w_static), "0 to 1e6"),
-            ("score.w_dynamic", self.score.w_dynamic, weight(self.score.w_dynamic), "0 to 1e6"),
-            ("score.lambda", self.score.lambda, weight(self.score.lambda), "0 to 1e6"),
-            ("score.mu", self.score.mu, weight(self.score.mu), "0 to 1e6"),
-            ("score.eta", self.score.eta, weight(self.score.eta), "0 to 1e6"),
-            ("score.xi", self.score.xi, weight(self.score.xi), "0 to 1e6"),
-            ("score.norm_epsilon", self.score.norm_epsilon, finite(self.score.norm_epsilon), "finite, 0 or more"),
-            ("select.keep_fraction", self.select.keep_fraction, in_unit(self.select.keep_fraction), "0 to 1"),
-            ("select.tau_static", self.select.tau_static, finite(self.select.tau_static), "finite, 0 or more"),
-            ("select.tau_dynamic", self.select.tau_dynamic, nonnegative(self.select.tau_dynamic), "0 or more"),
-            (
-                "select.round_fraction",
-                self.select.round_fraction,
-                (0.01..=MAX_ROUND_FRACTION).contains(&self.select.round_fraction) || self.select.round_fraction == 1.0,
-                "0.01 to 0.99, or 1 for no rounds",
-            ),
-            ("select.round_views", self.select.round_views as f64, self.select.round_views > 0, "1 or more"),
-            (
-                "select.round_groups",
-                self.select.round_groups as f64,
-                (1..=1000).contains(&self.select.round_groups),
-                "1 to 1000",
-            ),
-            ("refine.refine_steps", refine_steps.into(), refine_steps <= MAX_STEPS, "0 to 1000000"),
-            ("refine.refine_steps_per_prune", steps_per_prune.into(), steps_per_prune <= MAX_STEPS, "0 to 1000000"),
-            (
-                "merge.passes",
-                self.merge.passes.len() as f64,
-                self.merge.passes.len() <= MAX_PASSES,
-                "at most 16 passes",
-            ),
-            (
-                "refine.refine_target_views",
-                self.refine.refine_target_views as f64,
-                (16..=1_000_000).contains(&self.refine.refine_target_views),
-                "16 to 1000000",
-            ),
-            ("refine.refine_keyframes", refine_keyframes as f64, refine_keyframes <= 1000, "0 to 1000"),
-            ("refine.refine_archive_steps", archive_steps.into(), archive_steps <= MAX_STEPS, "0 to 1000000"),
-            ("refine.refine_ssim", self.refine.refine_ssim, in_unit(self.refine.refine_ssim), "0 to 1"),
-            ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),
-            ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),
-            ("merge.max_color_difference", max_color_difference, nonnegative(max_color_difference), "0 or more"),
-            ("merge.motion_noise", motion_noise, finite(motion_noise), "finite, 0 or more"),
-            ("merge.max_drift", max_drift, nonnegative(max_drift), "0 or more"),
-            ("merge.max_dead_time", max_dead_time, nonnegative(max_dead_time), "0 or more"),
-            ("field.field_margin", self.field.field_margin, finite(self.field.field_margin), "finite, 0 or more"),
-            ("bands.bands_margin", self.bands.bands_margin, finite(self.bands.bands_margin), "finite, 0 or more"),
-            (
-                "merge.max_neighbors",
-                self.merge.max_neighbors as f64,
-                (1..=1024).contains(&self.merge.max_neighbors),
-                "1 to 1024",
-            ),
-        ];
-        for pass in &self.merge.passes {
-            checks.extend([
-                ("merge.passes.epsilon", pass.epsilon, finite(pass.epsilon), "finite, 0 or more"),
-                ("merge.passes.d0", pass.d0, nonnegative(pass.d0), "0 or more"),
-                ("merge.passes.rho", pass.rho, (-1.0..=1.0).contains(&pass.rho), "-1 to 1"),
-                ("merge.passes.tau_m", pass.tau_m, (-1.0..=1.0).contains(&pass.tau_m), "-1 to 1"),
-            ]);
+        let table = toml::Table::try_from(self).map_err(|error| error.to_string())?;
+        let number = |value: &toml::Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
+        for (section, key, range) in RANGES {
+            let value = table.get(section).and_then(|values| number(values.get(key)?));
+            check_range(&format!("{section}.{key}"), value.unwrap_or(f64::NAN), range)?;
         }
-        match checks.iter().find(|check| !check.2) {
-            Some((name, value, _, range)) => Err(format!("{name}: expected {range}, found {value}")),
-            None => Ok(()),
+        let fraction = self.select.round_fraction;
+        if !(0.01..=MAX_ROUND_FRACTION).contains(&fraction) && fraction != 1.0 {
+            return Err(format!("select.round_fraction: expected 0.01 to 0.99, or 1 for no rounds, found {fraction}"));
         }
+        let passes = &self.merge.passes;
+        if passes.len() > MAX_PASSES {
+            return Err(format!("merge.passes: expected at most {MAX_PASSES} passes, found {}", passes.len()));
+        }
+        passes.iter().try_for_each(|pass| {
+            check_range("merge.passes.epsilon", pass.epsilon, FINITE)?;
+            check_range("merge.passes.d0", pass.d0, NONNEGATIVE)?;
+            check_range("merge.passes.rho", pass.rho, [-1.0, 1.0])?;
+            check_range("merge.passes.tau_m", pass.tau_m, [-1.0, 1.0])
+        })
     }
+}
+
+/// Range of fractions: minimum and maximum.
+const FRACTION: [f64; 2] = [0.0, 1.0];
+/// Range of weights. The maximum keeps weighted sums finite, so that a weight of 0 gives 0 and not NaN.
+const WEIGHT: [f64; 2] = [0.0, 1e6];
+/// Range of finite numbers from 0.
+const FINITE: [f64; 2] = [0.0, f64::MAX];
+/// Range of numbers from 0, infinity included.
+const NONNEGATIVE: [f64; 2] = [0.0, f64::INFINITY];
+/// Range of numbers of optimization steps.
+const STEPS: [f64; 2] = [0.0, MAX_STEPS as f64];
+
+/// Ranges of the parameters that are numbers: the table of the recipe, the key in it, and the minimum and maximum.
+const RANGES: [(&str, &str, [f64; 2]); 27] = [
+    ("scan", "alpha_min", FRACTION),
+    ("scan", "outside", FRACTION),
+    ("score", "w_static", WEIGHT),
+    ("score", "w_dynamic", WEIGHT),
+    ("score", "lambda", WEIGHT),
+    ("score", "mu", WEIGHT),
+    ("score", "eta", WEIGHT),
+    ("score", "xi", WEIGHT),
+    ("score", "norm_epsilon", FINITE),
+    ("select", "keep_fraction", FRACTION),
+    ("select", "tau_static", FINITE),
+    ("select", "tau_dynamic", NONNEGATIVE),
+    ("select", "round_views", [1.0, f64::INFINITY]),
+    ("select", "round_groups", [1.0, 1000.0]),
+    ("select", "contrast_floor", FRACTION),
+    ("merge", "max_scale_ratio", [1.0, f64::INFINITY]),
+    ("merge", "max_color_difference", NONNEGATIVE),
+    ("merge", "motion_noise", FINITE),
+    ("merge", "max_drift", NONNEGATIVE),
+    ("merge", "max_dead_time", NONNEGATIVE),
+    ("refine", "refine_steps", STEPS),
+    ("refine", "refine_steps_per_prune", STEPS),
+    ("refine", "refine_archive_steps", STEPS),
+    ("refine", "refine_target_views", [16.0, 1e6]),
+    ("refine", "refine_keyframes", [0.0, 1000.0]),
+    ("refine", "refine_ssim", FRACTION),
+    ("field", "field_margin", FINITE),
+];
+
+/// Checks that the value `value` of the parameter `name` is within the range from `min` to `max`; NaN is not. Fails
+/// with a message that states the range.
+fn check_range(name: &str, value: f64, [min, max]: [f64; 2]) -> std::result::Result<(), String> {
+    if (min..=max).contains(&value) {
+        return Ok(());
+    }
+    let range = match max {
+        f64::INFINITY => format!("{min} or more"),
+        f64::MAX => format!("finite, {min} or more"),
+        _ => format!("{min} to {max}"),
+    };
+    Err(format!("{name}: expected {range}, found {value}"))
 }
 
 /// Returns the message of `error` for users, with the expected type of a value in plain words instead of the name of a

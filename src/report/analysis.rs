@@ -17,5 +17,5 @@ pub(super) struct Analysis {
     /// Animations that the page shows for this compressed model.
     pub(super) films: Vec<FilmPanel>,
     /// Images of the places with the worst damage: one pair of images for each failure mode that can be judged.
-    pub(super) close: Vec<WorstPlaceImages>,
+    pub(super) worst_places: Vec<WorstPlaceImages>,
 }

@@ -1,19 +1,17 @@
 //! Charts as SVG elements of a page.
 //!
-//! Input: numbers and names. Output: one `<svg>` element with colors from [`STYLE`] and the font of the page around it.
-//! Values that are not finite are not drawn. Series differ by shape and dash as well as by color. The colors are those
-//! of Okabe and Ito ("Color Universal Design", 2008), which color-blind people can tell apart.
+//! Input: numbers and names. Output: one `<svg>` element with colors from `chart.css` and the font of the page around
+//! it. Values that are not finite are not drawn. Series differ by shape and dash as well as by color. The colors are
+//! those of Okabe and Ito ("Color Universal Design", 2008), which color-blind people can tell apart.
 
 use std::fmt::{self, Write as _};
 
+use super::document::figure_of;
 use super::html::{escape, figure};
-
-/// Style sheet of charts, which a page must hold once.
-pub const STYLE: &str = include_str!("chart.css");
 
 /// Width of a chart in SVG units, which are about a pixel each.
 const WIDTH: f64 = 480.0;
-/// Height of a chart with two axes, in SVG units (about pixels).
+/// Height of a chart in SVG units (about pixels).
 const HEIGHT: f64 = 270.0;
 /// Left margin of a chart, in SVG units (about pixels).
 const LEFT: f64 = 80.0;
@@ -25,8 +23,8 @@ const BOTTOM: f64 = 46.0;
 const LINE: f64 = 18.0;
 /// Approximate width of a letter in SVG units (about pixels), on a narrow page, where letters are largest.
 const LETTER: f64 = 8.2;
-/// Number of different styles of series (color, shape, dash) that [`STYLE`] defines.
-const LOOKS: usize = 9;
+/// Number of different styles of series (color, shape, dash) that `chart.css` defines.
+const STYLE_COUNT: usize = 9;
 
 /// Axis of a chart, as the caller describes it.
 #[derive(Debug, Clone, Default)]
@@ -35,8 +33,18 @@ pub struct ChartAxis {
     pub label: String,
     /// Whether the axis is logarithmic. Values that are not positive are then left out.
     pub log: bool,
-    /// Whether the axis must reach 0. Ignored if the axis is logarithmic.
-    pub from_zero: bool,
+}
+
+impl ChartAxis {
+    /// Returns a linear axis for the quantity `label`.
+    pub fn linear(label: &str) -> ChartAxis {
+        ChartAxis { label: label.to_owned(), log: false }
+    }
+
+    /// Returns a logarithmic axis for the quantity `label`.
+    pub fn log(label: &str) -> ChartAxis {
+        ChartAxis { label: label.to_owned(), log: true }
+    }
 }
 
 /// Series of points in a plot, drawn in one style.
@@ -51,14 +59,14 @@ pub struct Series {
     /// Whether the series is paired with the series before it. It then has the same color, dashed lines and hollow
     /// marks.
     pub paired: bool,
-    /// Texts beside the points, shown where there is room: one per point, or none at all.
+    /// Texts beside the points, shown where there is space: one per point, or none at all.
     pub labels: Vec<String>,
 }
 
 /// Plot of series over two axes.
 #[derive(Debug, Clone, Default)]
 pub struct Plot {
-    /// Description of the chart for readers who do not see it.
+    /// Caption of the chart.
     pub title: String,
     /// Horizontal axis.
     pub x: ChartAxis,
@@ -66,20 +74,6 @@ pub struct Plot {
     pub y: ChartAxis,
     /// Series in the order of the legend.
     pub series: Vec<Series>,
-}
-
-/// Chart of horizontal bars, or marks, with one value per name.
-#[derive(Debug, Clone, Default)]
-pub struct BarChart {
-    /// Description of the chart for readers who do not see it.
-    pub title: String,
-    /// Measured quantity and its unit, written below the axis.
-    pub label: String,
-    /// Name and value of each bar, from top to bottom.
-    pub bars: Vec<(String, f64)>,
-    /// Whether the axis covers only the range of the values. If so, each value is drawn as a mark. If not, the axis
-    /// starts at 0, and each value is drawn as a bar.
-    pub is_fitted: bool,
 }
 
 /// Chart of stacked counts: for each bin of values, the counts of several groups of items on top of one another.
@@ -116,32 +110,22 @@ impl AxisScale {
         if low > high {
             return None;
         }
-        if axis.from_zero && !axis.log {
-            (low, high) = (low.min(0.0), high.max(0.0));
-        }
         if axis.log {
             (low, high) = (low.log10(), high.log10());
         }
         if high - low < 1e-12 * high.abs().max(1e-9) {
-            let room = if axis.log { 0.3 } else { 0.05 * high.abs().max(1e-9) };
-            (low, high) = (low - room, high + room);
+            let margin = if axis.log { 0.3 } else { 0.05 * high.abs().max(1e-9) };
+            (low, high) = (low - margin, high + margin);
         }
-        let room = 0.04 * (high - low);
-        let flat = axis.from_zero && !axis.log;
-        Some(AxisScale {
-            log: axis.log,
-            low: if flat && low == 0.0 { low } else { low - room },
-            high: if flat && high == 0.0 { high } else { high + room },
-            start,
-            end,
-        })
+        let margin = 0.04 * (high - low);
+        Some(AxisScale { log: axis.log, low: low - margin, high: high + margin, start, end })
     }
 
-    /// Extends the range of values of this axis at its upper end, so that about `room` SVG units (about pixels) stay
+    /// Extends the range of values of this axis at its upper end, so that about `margin` SVG units (about pixels) stay
     /// free after the largest value.
-    fn reserve_end(&mut self, room: f64) {
+    fn reserve_end(&mut self, margin: f64) {
         let length = self.end - self.start;
-        self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
+        self.high += (self.high - self.low) * margin / (length - margin).max(0.5 * length);
     }
 
     /// Returns the position at which `value` is drawn, in SVG units (about pixels); `None` if the value is not finite,
@@ -188,16 +172,21 @@ fn even_ticks(low: f64, high: f64) -> Vec<f64> {
 }
 
 impl Plot {
+    /// Returns the plot as an HTML figure, with its title as the caption.
+    pub fn figure(&self) -> String {
+        figure_of(&self.title, &self.svg())
+    }
+
     /// Returns the plot as an `<svg>` element.
     pub fn svg(&self) -> String {
-        let looks = self.looks();
+        let styles = self.styles();
         let legend: Vec<LegendEntry<'_>> = self
             .series
             .iter()
-            .zip(&looks)
-            .map(|(of, &look)| LegendEntry { name: &of.name, look, joined: of.joined })
+            .zip(&styles)
+            .map(|(of, &style)| LegendEntry { name: &of.name, style, joined: of.joined })
             .collect();
-        let mut out = Drawing::new(&self.title, &legend, HEIGHT);
+        let mut out = Drawing::new(&self.title, &legend);
         let points = || self.series.iter().flat_map(|series| series.points.iter().copied());
         let x = AxisScale::new(&self.x, points().map(|p| p.0), [LEFT, WIDTH - RIGHT]);
         let y = AxisScale::new(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
@@ -205,18 +194,18 @@ impl Plot {
         let longest = self.series.iter().flat_map(|series| &series.labels).map(|label| label.chars().count()).max();
         x.reserve_end(longest.unwrap_or(0) as f64 * LETTER);
         out.axes(&x, &y, &self.x.label, &self.y.label);
-        for (series, look) in self.series.iter().zip(looks) {
+        for (series, style) in self.series.iter().zip(styles) {
             let place = |(k, &(a, b)): (usize, &(f64, f64))| Some((k, x.at(a)?, y.at(b)?));
             let places: Vec<(usize, f64, f64)> = series.points.iter().enumerate().filter_map(place).collect();
             if series.joined && places.len() > 1 {
                 let line: Vec<String> = places.iter().map(|p| format!("{:.1},{:.1}", p.1, p.2)).collect();
-                out.push(&format!("<polyline class=\"line {look}\" points=\"{}\"/>", line.join(" ")));
+                out.push(&format!("<polyline class=\"line {style}\" points=\"{}\"/>", line.join(" ")));
             }
             for (k, px, py) in places {
                 let (a, b) = series.points[k];
                 let words = [series.name.as_str(), series.labels.get(k).map_or("", String::as_str)];
                 let tip = format!("{} {}, {}", words.join(" ").trim(), figure(a), figure(b));
-                out.mark(look, px, py, tip.trim_start());
+                out.mark(style, px, py, tip.trim_start());
                 out.label(px, py, words[1]);
             }
         }
@@ -224,54 +213,14 @@ impl Plot {
     }
 
     /// Returns the style (color, shape, dash) of every series.
-    fn looks(&self) -> Vec<SeriesStyle> {
+    fn styles(&self) -> Vec<SeriesStyle> {
         let mut colors = 0;
-        let look = |series: &Series| {
+        let style = |series: &Series| {
             let hollow = series.paired && colors > 0;
             colors += usize::from(!hollow);
             SeriesStyle { hollow, ..SeriesStyle::from_number(colors - 1) }
         };
-        self.series.iter().map(look).collect()
-    }
-}
-
-impl BarChart {
-    /// Returns the bars as an `<svg>` element, whose height depends on the number of bars.
-    pub fn svg(&self) -> String {
-        const ROW: f64 = 24.0;
-        let height = ROW * self.bars.len() as f64 + BOTTOM + 8.0;
-        let mut out = Drawing::new(&self.title, &[], height);
-        let longest = self.bars.iter().map(|bar| bar.0.chars().count()).max().unwrap_or(0) as f64;
-        let left = (longest * LETTER + 14.0).max(LEFT);
-        let axis = ChartAxis { from_zero: !self.is_fitted, ..ChartAxis::default() };
-        let values = self.bars.iter().map(|bar| bar.1);
-        let Some(x) = AxisScale::new(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
-        out.x_axis(&x, &self.label, [8.0, height - BOTTOM]);
-        for (row, (name, value)) in self.bars.iter().enumerate() {
-            let start = if self.is_fitted { Some(x.start) } else { x.at(0.0) };
-            let (Some(start), Some(end)) = (start, x.at(*value)) else { continue };
-            let y = 8.0 + ROW * row as f64;
-            let middle = y + 0.5 * ROW + 4.0;
-            out.push(&format!(
-                "<text class=\"end\" x=\"{:.1}\" y=\"{middle:.1}\">{}</text><text x=\"{:.1}\" y=\"{middle:.1}\">{}</text>",
-                left - 8.0,
-                escape(name),
-                end + 8.0,
-                figure(*value),
-            ));
-            if self.is_fitted {
-                out.push(&format!("<path class=\"grid\" d=\"M{start:.1} {:.1}H{end:.1}\"/>", middle - 4.0));
-                out.mark(SeriesStyle::from_number(0), end, middle - 4.0, name);
-            } else {
-                out.push(&format!(
-                    "<rect class=\"area s0\" x=\"{start:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\"/>",
-                    y + 4.0,
-                    (end - start).max(0.0),
-                    ROW - 8.0,
-                ));
-            }
-        }
-        out.finish()
+        self.series.iter().map(style).collect()
     }
 }
 
@@ -280,16 +229,17 @@ impl StackedHistogram {
     pub fn svg(&self) -> String {
         let names = self.groups.iter().enumerate();
         let legend: Vec<LegendEntry<'_>> = names
-            .map(|(number, of)| LegendEntry { name: &of.0, look: SeriesStyle::from_number(number), joined: false })
+            .map(|(number, of)| LegendEntry { name: &of.0, style: SeriesStyle::from_number(number), joined: false })
             .collect();
-        let mut out = Drawing::new(&self.title, &legend, HEIGHT);
+        let mut out = Drawing::new(&self.title, &legend);
         let bins = self.edges.len().saturating_sub(1);
         let count = |group: &(String, Vec<usize>), bin: usize| group.1.get(bin).copied().unwrap_or(0);
         let total = |bin| self.groups.iter().map(|group| count(group, bin)).sum::<usize>() as f64;
-        let up = ChartAxis { from_zero: true, ..ChartAxis::default() };
         let x = AxisScale::new(&self.x, self.edges.iter().copied(), [LEFT, WIDTH - RIGHT]);
-        let y = AxisScale::new(&up, (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
-        let (Some(x), Some(y)) = (x, y) else { return out.empty() };
+        let y = AxisScale::new(&ChartAxis::default(), (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
+        let (Some(x), Some(mut y)) = (x, y) else { return out.empty() };
+        // Bars stand on 0.
+        y.low = 0.0;
         out.axes(&x, &y, &self.x.label, "Gaussians");
         for bin in 0..bins {
             let (low, high) = (self.edges[bin], self.edges[bin + 1]);
@@ -317,18 +267,18 @@ impl StackedHistogram {
     }
 }
 
-/// Style of a series, which selects CSS classes of [`STYLE`].
+/// Style of a series, which selects CSS classes of `chart.css`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SeriesStyle {
-    /// Index of the style (color, shape, dash) in [`STYLE`]; less than [`LOOKS`].
+    /// Index of the style (color, shape, dash) in `chart.css`; less than [`STYLE_COUNT`].
     number: usize,
     hollow: bool,
 }
 
 impl SeriesStyle {
-    /// Returns the style with the index `number` modulo [`LOOKS`], with solid lines and filled marks.
+    /// Returns the style with the index `number` modulo [`STYLE_COUNT`], with solid lines and filled marks.
     fn from_number(number: usize) -> SeriesStyle {
-        SeriesStyle { number: number % LOOKS, hollow: false }
+        SeriesStyle { number: number % STYLE_COUNT, hollow: false }
     }
 }
 
@@ -341,14 +291,13 @@ impl fmt::Display for SeriesStyle {
 /// Entry of a legend: a name and the style of its mark.
 struct LegendEntry<'a> {
     name: &'a str,
-    look: SeriesStyle,
+    style: SeriesStyle,
     joined: bool,
 }
 
 /// Chart that is being written, as an SVG element.
 struct Drawing {
     text: String,
-    height: f64,
     /// Top of the plot area, below the legend, in SVG units (about pixels).
     top: f64,
     /// Left end, baseline and width of each label placed so far, in SVG units (about pixels).
@@ -356,16 +305,15 @@ struct Drawing {
 }
 
 impl Drawing {
-    fn new(title: &str, legend: &[LegendEntry<'_>], height: f64) -> Drawing {
+    fn new(title: &str, legend: &[LegendEntry<'_>]) -> Drawing {
         let title = escape(title);
         let mut out = Drawing {
-            text: format!("<svg class=\"chart\" viewBox=\"0 0 {WIDTH} {height}\" role=\"img\" aria-label=\"{title}\">"),
-            height,
+            text: format!("<svg class=\"chart\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{title}\">"),
             top: 10.0,
             labels: Vec::new(),
         };
         let (mut x, mut y) = (LEFT, 17.0);
-        for LegendEntry { name, look, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
+        for LegendEntry { name, style, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
             // Width of the mark, or of a piece of the line with the mark.
             let sample = if *joined { 26.0 } else { 12.0 };
             let wide = name.chars().count() as f64 * LETTER + sample + 22.0;
@@ -373,9 +321,9 @@ impl Drawing {
                 (x, y) = (LEFT, y + LINE);
             }
             if *joined {
-                out.push(&format!("<path class=\"line {look}\" d=\"M{x:.1} {:.1}h{sample}\"/>", y - 4.0));
+                out.push(&format!("<path class=\"line {style}\" d=\"M{x:.1} {:.1}h{sample}\"/>", y - 4.0));
             }
-            out.mark(*look, x + 0.5 * sample, y - 4.0, name);
+            out.mark(*style, x + 0.5 * sample, y - 4.0, name);
             out.push(&format!("<text x=\"{:.1}\" y=\"{y:.1}\">{}</text>", x + sample + 4.0, escape(name)));
             x += wide;
             out.top = y + 12.0;
@@ -387,19 +335,19 @@ impl Drawing {
         self.text.push_str(element);
     }
 
-    /// Draws a point at (`x`, `y`) in the shape of the style `look`, with the tooltip `tip`.
-    fn mark(&mut self, look: SeriesStyle, x: f64, y: f64, tip: &str) {
-        let shape = match look.number % 4 {
-            0 => format!("<circle class=\"mark {look}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
+    /// Draws a point at (`x`, `y`) in the shape of the style `style`, with the tooltip `tip`.
+    fn mark(&mut self, style: SeriesStyle, x: f64, y: f64, tip: &str) {
+        let shape = match style.number % 4 {
+            0 => format!("<circle class=\"mark {style}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
             1 => format!(
-                "<rect class=\"mark {look}\" x=\"{:.1}\" y=\"{:.1}\" width=\"6.4\" height=\"6.4\">",
+                "<rect class=\"mark {style}\" x=\"{:.1}\" y=\"{:.1}\" width=\"6.4\" height=\"6.4\">",
                 x - 3.2,
                 y - 3.2
             ),
-            2 => format!("<path class=\"mark {look}\" d=\"M{x:.1} {:.1}l4.2 7.4h-8.4z\">", y - 4.6),
-            _ => format!("<path class=\"mark {look}\" d=\"M{x:.1} {:.1}l4.6 4.6l-4.6 4.6l-4.6 -4.6z\">", y - 4.6),
+            2 => format!("<path class=\"mark {style}\" d=\"M{x:.1} {:.1}l4.2 7.4h-8.4z\">", y - 4.6),
+            _ => format!("<path class=\"mark {style}\" d=\"M{x:.1} {:.1}l4.6 4.6l-4.6 4.6l-4.6 -4.6z\">", y - 4.6),
         };
-        let close = match look.number % 4 {
+        let close = match style.number % 4 {
             0 => "</circle>",
             1 => "</rect>",
             _ => "</path>",
@@ -449,18 +397,13 @@ impl Drawing {
             "<text class=\"middle\" transform=\"translate(17 {middle:.1}) rotate(-90)\">{}</text>",
             escape(y_label)
         );
-        self.x_axis(x, x_label, [self.top, bottom]);
-    }
-
-    /// Draws ticks, grid lines and label of the horizontal axis `x`. The grid lines run from `top` to `bottom`, in SVG
-    /// units (about pixels).
-    fn x_axis(&mut self, x: &AxisScale, label: &str, [top, bottom]: [f64; 2]) {
         for tick in x.ticks() {
             let Some(at) = x.at(tick) else { continue };
             let _ = write!(
                 self.text,
-                "<path class=\"grid\" d=\"M{at:.1} {top:.1}V{bottom:.1}\"/>\
+                "<path class=\"grid\" d=\"M{at:.1} {:.1}V{bottom:.1}\"/>\
                  <text class=\"middle\" x=\"{at:.1}\" y=\"{:.1}\">{}</text>",
+                self.top,
                 bottom + 21.0,
                 figure(tick)
             );
@@ -472,12 +415,12 @@ impl Drawing {
             x.end,
             0.5 * (x.start + x.end),
             bottom + 39.0,
-            escape(label)
+            escape(x_label)
         );
     }
 
     fn empty(mut self) -> String {
-        let middle = 0.5 * self.height;
+        let middle = 0.5 * HEIGHT;
         self.push(&format!("<text class=\"middle\" x=\"{}\" y=\"{middle}\">nothing to show</text>", 0.5 * WIDTH));
         self.finish()
     }
@@ -503,7 +446,6 @@ mod tests {
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
         assert_eq!(svg.matches("<circle").count(), 1 + 2, "the legend's and one per point");
         assert!(plot(&[(f64::NAN, 1.0)]).svg().contains("nothing to show"));
-        assert!(BarChart::default().svg().contains("nothing to show"));
         assert!(StackedHistogram::default().svg().contains("nothing to show"));
     }
 
@@ -522,15 +464,15 @@ mod tests {
             labels: ["first", "lost", "last"].map(String::from).to_vec(),
         };
         let plot = Plot { series: [false, true, false, true].map(series).to_vec(), ..Plot::default() };
-        let looks: Vec<String> = plot.looks().iter().map(SeriesStyle::to_string).collect();
-        assert_eq!(looks, ["s0", "s0 hollow", "s1", "s1 hollow"]);
+        let styles: Vec<String> = plot.styles().iter().map(SeriesStyle::to_string).collect();
+        assert_eq!(styles, ["s0", "s0 hollow", "s1", "s1 hollow"]);
         let svg = plot.svg();
         let times = |label: &str| svg.matches(&format!(">{label}</text>")).count();
         // In the corner below there is room for one, around the point above for all.
         assert_eq!(["first", "lost", "last"].map(times), [1, 0, 4], "{svg}");
         // A pair needs a first.
         let alone = Plot { series: vec![series(true)], ..Plot::default() };
-        assert_eq!(alone.looks(), [SeriesStyle::from_number(0)]);
+        assert_eq!(alone.styles(), [SeriesStyle::from_number(0)]);
     }
 
     #[test]
@@ -549,9 +491,7 @@ mod tests {
 
     #[test]
     fn higher_values_lie_higher_and_bins_stand_on_one_another() {
-        let axis = ChartAxis { from_zero: true, ..ChartAxis::default() };
-        let scale = AxisScale::new(&axis, [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
-        assert_eq!(scale.at(0.0), Some(200.0));
+        let scale = AxisScale::new(&ChartAxis::default(), [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
         assert!(scale.at(4.0) < scale.at(1.0));
         let groups = vec![("kept".to_owned(), vec![3, 0]), ("dropped".to_owned(), vec![1, 2])];
         let svg = StackedHistogram { edges: vec![0.0, 1.0, 2.0], groups, ..StackedHistogram::default() }.svg();

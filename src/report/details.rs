@@ -1,18 +1,19 @@
 //! Collapsed sections of the report page: all figures, the stages of the run, the scores, the notes and the data files.
 
 use super::analysis::Analysis;
-use super::chart::{BarChart, ChartAxis, StackedHistogram};
-use super::document::{figure_of, heading, links, list};
+use super::chart::{ChartAxis, StackedHistogram};
+use super::document::{figure_of, heading, links, list, table};
 use super::findings::CompressedModelData;
 use super::histogram::Histogram;
-use super::html::{bytes, count, db, escape, figure, percent};
+use super::html::{db, escape, figure, percent};
 use super::run::RunFiles;
-use super::{cards, compare, failure_section, precision, quality, trade_off};
+use super::{compare, failure_section, precision, quality, trade_off};
 use crate::evaluation::precision::PrecisionDiagram;
-use crate::evaluation::results::{Comparison, QualityMeans};
+use crate::evaluation::results::{Comparison, OriginalAndCompressed, QualityMeans};
 use crate::evaluation::trade_off::TradeOff;
-use crate::journal::records::StageRecord;
+use crate::models::ModelSize;
 use crate::pipeline::summary::Summary;
+use crate::progress::{decimal_bytes, grouped};
 
 /// Returns the HTML of the collapsed sections of the page, each with a label and one line of explanation. `results` are
 /// the compressed models and `names` their names; `sweep` and `precision` hold the curves to include.
@@ -47,7 +48,7 @@ pub(super) fn details(
             "weak",
             "Known weak spots",
             "Fast motion, thin structures and small changes of appearance suffer first when a model is compressed.",
-            each(&|result, _| failure_section::modes(&result.data.failure_modes, &result.close)),
+            each(&|result, _| failure_section::modes(&result.data.failure_modes, &result.worst_places)),
         ),
         (
             "stages",
@@ -100,17 +101,16 @@ fn absent(text: &str) -> String {
 /// the name of the model, `result` its data.
 fn numbers(result: &CompressedModelData, name: &str) -> String {
     let found = &result.evaluation;
-    let mut out = format!(
-        "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"Measures of {}\"><table class=\"wide\">\n\
-         <tr><th>measure</th><th>average</th><th>worst frame (mean)</th><th>worst view (mean)</th></tr>\n",
-        escape(name)
-    );
-    out += &measures("compressed to original", &found.loss);
+    let mut rows = measures("compressed to original", &found.loss);
     if let Some(truth) = &found.ground_truth {
-        out += &measures("compressed to photographs", &truth.compressed);
-        out += &measures("original to photographs", &truth.original);
+        rows.extend(measures("compressed to photographs", &truth.compressed));
+        rows.extend(measures("original to photographs", &truth.original));
     }
-    out += "</table></div>\n";
+    let mut out = format!(
+        "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"Measures of {}\">{}</div>\n",
+        escape(name),
+        table("wide", ["measure", "average", "worst frame (mean)", "worst view (mean)"], rows)
+    );
     out += "<p class=\"note\">PSNR and SSIM: higher is better. Temporal error, the root mean square error of frame-to-frame \
             differences, and FLIP, the difference that a person would see: lower is better.</p>\n";
     if let Some(time) = result.render_time {
@@ -120,54 +120,52 @@ fn numbers(result: &CompressedModelData, name: &str) -> String {
             time.before, time.after
         );
     }
-    let parts = cards::size_parts(&found.size);
+    let parts = size_parts(&found.size);
     if !parts.is_empty() {
-        out +=
-            "<table class=\"wide\">\n<tr><th>part of the size</th><th>before</th><th>after</th><th>share</th></tr>\n";
-        for (name, before, after) in parts {
-            out += &format!(
-                "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>\n",
-                escape(name),
-                bytes(before),
-                bytes(after),
-                percent(after as f64, before as f64)
-            );
-        }
-        out += "</table>\n";
+        let rows = parts.into_iter().map(|(name, before, after)| {
+            [escape(name), decimal_bytes(before), decimal_bytes(after), percent(after as f64, before as f64)]
+        });
+        out += &table("wide", ["part of the size", "before", "after", "share"], rows);
     }
     out
+}
+
+/// Returns the parts of the size (such as Gaussians and deformation field) that both models have and that take more
+/// than 1% of the compressed model's bytes. Each is a tuple: name, bytes of the original, bytes of the compressed
+/// model. Returns an empty list if there are fewer than two such parts.
+fn size_parts(size: &OriginalAndCompressed<ModelSize>) -> Vec<(&'static str, u64, u64)> {
+    let parts = size.original.named_parts().into_iter().zip(size.compressed.named_parts());
+    let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
+    // Parts below 1% of the compressed model are left out.
+    let least = size.compressed.total() / 100;
+    let both: Vec<_> = parts.into_iter().filter(|&(_, before, after)| before > 0 && after > least).collect();
+    if both.len() > 1 { both } else { Vec::new() }
 }
 
 /// Quality measure, such as PSNR. The fields are, in order: its name, the function that returns its mean, the function
 /// that formats a value, and whether larger values are better.
 type Measure = (&'static str, fn(&QualityMeans) -> Option<f64>, fn(f64) -> String, bool);
 
-/// Returns HTML table rows, one per quality measure, with the average, the worst frame and the worst view of the
-/// comparison `of`. `name` says what is compared, such as "compressed to original".
-fn measures(name: &str, of: &Comparison) -> String {
+/// Returns the cells of table rows, one row per quality measure, with the average, the worst frame and the worst view
+/// of the comparison `of`. `name` says what is compared, such as "compressed to original".
+fn measures(name: &str, of: &Comparison) -> Vec<[String; 4]> {
     const MEASURES: [Measure; 4] = [
         ("PSNR", |means| Some(means.psnr), db, true),
         ("SSIM", |means| Some(means.ssim), |value| format!("{value:.4}"), true),
         ("temporal error", |means| means.temporal, figure, false),
         ("FLIP", |means| means.flip, |value| format!("{value:.4}"), false),
     ];
-    let mut out = String::new();
-    for (measure, value, text, is_larger_better) in MEASURES {
-        let Some(average) = value(&of.overall) else { continue };
+    let row = |(measure, value, text, is_larger_better): Measure| {
+        let average = value(&of.overall)?;
         let worse = |a: &f64, b: &f64| if is_larger_better { a.total_cmp(b) } else { b.total_cmp(a) };
         let frames = of.per_frame.iter().filter_map(|frame| Some((value(&frame.means)?, frame.frame)));
         let views = of.per_view.iter().filter_map(|view| Some((value(&view.means)?, view.view)));
         let frame =
             frames.min_by(|a, b| worse(&a.0, &b.0)).map(|(worst, frame)| format!("{} (frame {frame})", text(worst)));
         let view = views.min_by(|a, b| worse(&a.0, &b.0)).map(|(worst, view)| format!("{} (view {view})", text(worst)));
-        out += &format!(
-            "<tr><td>{measure}, {name}</td><td>{}</td><td>{}</td><td>{}</td></tr>\n",
-            text(average),
-            frame.unwrap_or_default(),
-            view.unwrap_or_default()
-        );
-    }
-    out
+        Some([format!("{measure}, {name}"), text(average), frame.unwrap_or_default(), view.unwrap_or_default()])
+    };
+    MEASURES.into_iter().filter_map(row).collect()
 }
 
 fn stages(run: &RunFiles) -> String {
@@ -176,41 +174,15 @@ fn stages(run: &RunFiles) -> String {
             "There is no summary of a run beside the compressed model; <code>splatsieve compress</code> writes one.",
         );
     };
-    let mut out = String::from(
-        "<table class=\"wide figures\">\n<tr><th>step</th><th>Gaussians in</th><th>out</th><th>time</th><th>peak memory so far</th></tr>\n",
-    );
+    let mut rows: Vec<[String; 5]> = Vec::new();
     for stage in &summary.stages {
         let memory = stage.peak_memory_bytes.map_or("–".to_owned(), |of| format!("{:.0} MiB", of as f64 / 1048576.0));
-        out += &format!(
-            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{:.2} s</td><td>{memory}</td></tr>\n",
-            escape(&stage.name),
-            count(stage.gaussians_in),
-            count(stage.gaussians_out),
-            stage.seconds
-        );
+        let seconds = format!("{:.2} s", stage.seconds);
+        rows.push([escape(&stage.name), grouped(stage.gaussians_in), grouped(stage.gaussians_out), seconds, memory]);
     }
     let total: f64 = summary.stages.iter().map(|stage| stage.seconds).sum();
-    out += &format!("<tr><th>together</th><td></td><td></td><th>{total:.2} s</th><td></td></tr>\n</table>\n");
-    let seconds = stage_bars(summary, "Time per step", "seconds", |stage| Some((1e3 * stage.seconds).round() / 1e3));
-    let mib = |stage: &StageRecord| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
-    let memory = stage_bars(summary, "Largest memory up to the end of each step", "MiB", mib);
-    if seconds.is_empty() && memory.is_empty() {
-        return out;
-    }
-    out + &format!("<div class=\"charts\">\n{seconds}{memory}</div>\n")
-}
-
-/// Returns a bar chart with one bar per stage of the run that wrote the compressed model. `value` returns the value of
-/// a stage, if it has one. `title`: caption of the chart. `label`: axis label. Returns an empty text if fewer than two
-/// stages have a value.
-fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&StageRecord) -> Option<f64>) -> String {
-    let bars: Vec<(String, f64)> =
-        summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
-    if bars.len() < 2 {
-        return String::new();
-    }
-    let chart = BarChart { title: title.to_owned(), label: label.to_owned(), bars, is_fitted: false };
-    figure_of(title, &chart.svg())
+    rows.push(["together".to_owned(), String::new(), String::new(), format!("{total:.2} s"), String::new()]);
+    table("wide figures", ["step", "Gaussians in", "out", "time", "peak memory so far"], rows)
 }
 
 /// Returns the histograms of the scores in `result` as charts; a score whose values all fall into one bin becomes a
@@ -239,7 +211,7 @@ fn score_histograms(result: &CompressedModelData) -> String {
         } else {
             let zero = of.zero.kept + of.zero.dropped + of.zero.merged;
             let value = of.edges.first().map_or(String::new(), |edge| format!(", the others near {}", figure(*edge)));
-            alike.push(format!("{} ({}): all values are alike, {} at 0{value}", of.meaning, of.name, count(zero)));
+            alike.push(format!("{} ({}): all values are alike, {} at 0{value}", of.meaning, of.name, grouped(zero)));
         }
     }
     out + "</div>\n" + &list(&alike)
@@ -247,14 +219,14 @@ fn score_histograms(result: &CompressedModelData) -> String {
 
 fn histogram(of: &Histogram) -> String {
     let with = |name: &str, zero: usize, bins: &[usize]| {
-        let more = if zero > 0 { format!(" (and {} at 0)", count(zero)) } else { String::new() };
+        let more = if zero > 0 { format!(" (and {} at 0)", grouped(zero)) } else { String::new() };
         (format!("{name}{more}"), bins.to_vec())
     };
     StackedHistogram {
         title: format!("{} of kept, dropped and merged Gaussians", of.meaning),
         x: match of.log {
-            true => ChartAxis { label: of.name.to_owned(), log: true, from_zero: false },
-            false => ChartAxis { label: format!("{}, part of the frames", of.name), ..ChartAxis::default() },
+            true => ChartAxis::log(of.name),
+            false => ChartAxis::linear(&format!("{}, part of the frames", of.name)),
         },
         edges: of.edges.clone(),
         groups: vec![
@@ -276,21 +248,12 @@ fn notes_section(result: &CompressedModelData, run: &RunFiles) -> String {
         if rows.is_empty() {
             rows.push(["nothing".to_owned(), "every step and term had something to do".to_owned()]);
         }
-        out += "<table class=\"wide words\">\n<tr><th>left out</th><th>why</th></tr>\n";
-        for [what, why] in rows {
-            out += &format!("<tr><td>{what}</td><td>{why}</td></tr>\n");
-        }
-        out += "</table>\n<table class=\"wide\">\n<tr><th>term of the scores</th><th>1st percentile</th><th>99th</th><th>use</th></tr>\n";
-        for term in &summary.terms {
-            let grades = if term.active { "grades" } else { "only splits" };
-            out += &format!(
-                "<tr><td>{}</td><td>{}</td><td>{}</td><td>{grades}</td></tr>\n",
-                escape(&term.name),
-                figure(term.p1),
-                figure(term.p99)
-            );
-        }
-        out += "</table>\n";
+        out += &table("wide words", ["left out", "why"], rows);
+        let terms = summary.terms.iter().map(|term| {
+            let usage = if term.active { "grades" } else { "only splits" };
+            [escape(&term.name), figure(term.p1), figure(term.p99), usage.to_owned()]
+        });
+        out += &table("wide", ["term of the scores", "1st percentile", "99th", "use"], terms);
     }
     let mut notes: Vec<&String> = result.notes.iter().collect();
     notes.extend(run.summary.iter().flat_map(|(summary, _)| &summary.notes));

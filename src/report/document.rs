@@ -3,11 +3,13 @@
 //! All text from files or paths passes through [`escape`]. The content security policy in the head allows a browser to
 //! load only images that the file contains and to run only the scripts whose digests it lists.
 
-use super::chart;
-use super::html::escape;
+use super::html::{escape, file_name};
 use crate::files::page_policy::{policy_digest, policy_meta_element};
 
+/// Style sheet of pages.
 const STYLE: &str = include_str!("page.css");
+/// Style sheet of charts.
+const CHART_STYLE: &str = include_str!("chart.css");
 
 /// Returns a complete HTML file with the title `title` and the content `body`. The JavaScript texts `scripts` run at
 /// the end of the page; they must not contain text from files.
@@ -25,15 +27,45 @@ pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          {policy}\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <title>{}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<main>\n{body}{scripts}</main>\n</body>\n</html>\n",
+         <title>{}</title>\n<style>\n{STYLE}{CHART_STYLE}</style>\n</head>\n<body>\n<main>\n\
+         {body}{scripts}</main>\n</body>\n</html>\n",
         escape(title),
-        chart::STYLE,
     )
+}
+
+/// Returns the HTML page of the measurements of the model `path`. `heading` begins the title. `files`: names of the
+/// data files beside the page. `tool`: program that made it.
+pub(super) fn measurements_page(heading: &str, path: &str, body: &str, files: &[&str], tool: &str) -> String {
+    let title = format!("{heading}: {}", file_name(path));
+    let body = format!(
+        "<header>\n<h1>{}</h1>\n</header>\n{body}<p>Everything on this page, as data beside it: {}.</p>\n\
+         <p class=\"note\">Made by {}.</p>\n",
+        escape(&title),
+        links(files),
+        escape(tool)
+    );
+    document(&title, &body, &[])
 }
 
 /// Returns an HTML figure: the chart `svg` with the caption `caption` above it.
 pub(super) fn figure_of(caption: &str, svg: &str) -> String {
     format!("<figure><figcaption>{}</figcaption>{svg}</figure>\n", escape(caption))
+}
+
+/// Returns an HTML table of the CSS class `class`: a row with the column headings `heads`, then `rows`. Headings and
+/// cells are HTML.
+pub(super) fn table<const N: usize>(
+    class: &str,
+    heads: [&str; N],
+    rows: impl IntoIterator<Item = [String; N]>,
+) -> String {
+    let row = |tag: &str, cells: &[String]| {
+        let cells = cells.iter().map(|cell| format!("<{tag}>{cell}</{tag}>"));
+        format!("<tr>{}</tr>\n", cells.collect::<String>())
+    };
+    let head = row("th", &heads.map(str::to_owned));
+    let rows: String = rows.into_iter().map(|cells| row("td", &cells)).collect();
+    format!("<table class=\"{class}\">\n{head}{rows}</table>\n")
 }
 
 /// Returns an HTML list of the notes `notes`; empty without notes.

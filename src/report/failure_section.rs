@@ -2,11 +2,12 @@
 
 use super::failure::{FailureMode, MIN_LOST_CONTRIBUTION, MIN_PSNR_GAP_DB, VISIBLE_ERROR_PSNR_DB, Verdict};
 use super::findings::WorstPlaceImages;
-use super::html::{count, db, escape, figure, percent};
+use super::html::{db, escape, figure, percent};
+use crate::progress::grouped;
 
 /// Returns the HTML of one card for each failure mode in `modes`. A card has the measurements of the failure mode and,
-/// if they are in `close`, the images of the place where it is worst.
-pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String {
+/// if they are in `worst_places`, the images of the place where it is worst.
+pub(super) fn modes(modes: &[FailureMode], worst_places: &[WorstPlaceImages]) -> String {
     let mut out = format!(
         "<p class=\"note\">Each pixel knows the share of its color that comes from a kind of Gaussian. A mode is flagged if \
          the PSNR where the kind is visible is below {VISIBLE_ERROR_PSNR_DB} dB and at least {MIN_PSNR_GAP_DB} dB below the PSNR elsewhere, \
@@ -30,14 +31,14 @@ pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String
             out += &format!("<tr><th>{name}</th><td>{value}</td></tr>\n");
         }
         out += "</table>\n";
-        if let Some(close) = close.iter().find(|close| close.mode == number) {
-            let [original, compressed] = &close.images;
+        if let Some(worst) = worst_places.iter().find(|place| place.mode == number) {
+            let [original, compressed] = &worst.images;
             out += &format!(
                 "<div class=\"close\"><img alt=\"original\" src=\"{original}\"><img alt=\"compressed\" src=\"{compressed}\"></div>\n\
                  <p class=\"note\">original and compressed where most of the error is, from pixel {}, {}: {}</p>\n",
-                close.corner.0,
-                close.corner.1,
-                db(close.psnr)
+                worst.corner.0,
+                worst.corner.1,
+                db(worst.psnr)
             );
         }
         out += "</article>\n";
@@ -47,8 +48,9 @@ pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String
 
 /// Returns the table rows for a failure mode: the name and the value (as text) of each measurement that is known.
 fn rows(mode: &FailureMode) -> Vec<(&'static str, String)> {
-    let of = |part: Option<usize>| part.map(|n| format!("{} ({})", count(n), percent(n as f64, mode.gaussians as f64)));
-    let mut rows = vec![("Gaussians", Some(count(mode.gaussians)))];
+    let of =
+        |part: Option<usize>| part.map(|n| format!("{} ({})", grouped(n), percent(n as f64, mode.gaussians as f64)));
+    let mut rows = vec![("Gaussians", Some(grouped(mode.gaussians)))];
     if mode.gaussians > 0 {
         let edges = |lost: f64| if lost <= 0.0 { "none".into() } else { percent(lost, 1.0) };
         rows.extend([

@@ -5,14 +5,10 @@
 //! animations of at most [`MAX_FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their
 //! difference: about 3 MB per result.
 
-use std::io;
-
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
-use super::shown_images::{MEDIAN, ShownImage, brighter, difference, shrink, shrinkage};
-use crate::error::{Error, Result};
+use super::shown_images::{MEDIAN, ShownImage, brighter, data_uri, difference, shrink, shrinkage};
+use crate::error::Result;
 use crate::evaluation::ModelPair;
 use crate::files::image::write::jpeg_bytes;
 use crate::memory_plan::Workload;
@@ -79,27 +75,29 @@ pub fn memory_bytes(work: &Workload) -> u64 {
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
-pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
-    let every = side.scene.source().info().times.len();
+pub fn render_films(pair: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
+    let every = pair.scene.source().info().times.len();
     let mut films: Vec<FilmPanel> = Vec::new();
     let mut cameras = Vec::new();
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
-        let FrameView { view, camera, .. } = side.view(choice.place);
+        let FrameView { view, camera, .. } = pair.view(choice.place);
         let wanted = k == 0 || choice.why.iter().any(|why| why == MEDIAN);
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == MAX_VIEWS {
             continue;
         }
         cameras.push(camera);
         let views = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), MAX_FRAMES);
-        let made = side.render_pairs(&views, |[original, compressed]| {
+        let made = pair.render_pairs(&views, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
-            let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));
+            let small = |image: &Image, most: u64| {
+                data_uri("jpeg", jpeg_bytes(&shrink(image, shrinkage(image, most)), JPEG_QUALITY))
+            };
             let images =
                 [small(original, MAX_PIXELS)?, small(compressed, MAX_PIXELS)?, small(&bright, MAX_DIFFERENCE_PIXELS)?];
             Ok((psnr(compressed, original), shrinkage(original, MAX_PIXELS), images))
         })?;
         let shrunk = made.first().map_or(1, |made| made.1);
-        let of = &side.scene.rig.cameras[camera as usize];
+        let of = &pair.scene.rig.cameras[camera as usize];
         films.push(FilmPanel {
             why: choice.why.clone(),
             view,
@@ -113,11 +111,4 @@ pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
         });
     }
     Ok(films)
-}
-
-/// Returns `image` as a data URI that contains a JPEG file.
-fn data_uri(image: &Image) -> Result<String> {
-    let bytes = jpeg_bytes(image, JPEG_QUALITY)
-        .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;
-    Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)))
 }

@@ -48,30 +48,6 @@ pub(super) fn figure(value: f64) -> String {
     }
 }
 
-/// Formats a whole number with separators between groups of three digits.
-pub(super) fn count(value: usize) -> String {
-    let digits = value.to_string();
-    let mut out = String::new();
-    for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i).is_multiple_of(3) {
-            out.push('\u{202f}');
-        }
-        out.push(digit);
-    }
-    out
-}
-
-/// Formats a number of bytes in kB, MB or GB.
-pub(super) fn bytes(value: u64) -> String {
-    let value = value as f64;
-    match value {
-        1e9.. => format!("{:.2} GB", value / 1e9),
-        1e6.. => format!("{:.2} MB", value / 1e6),
-        1e3.. => format!("{:.1} kB", value / 1e3),
-        _ => format!("{value} bytes"),
-    }
-}
-
 /// Formats `part` as a percentage of `whole`; 100% if `whole` is 0. Percentages above 0 and below 0.1% become "under
 /// 0.1%".
 pub(super) fn percent(part: f64, whole: f64) -> String {
@@ -110,8 +86,6 @@ mod tests {
         for (value, expected) in cases {
             assert_eq!(figure(value), expected, "{value}");
         }
-        assert_eq!(count(1_234_567).replace('\u{202f}', " "), "1 234 567");
-        assert_eq!([bytes(999), bytes(5_180_514)], ["999 bytes", "5.18 MB"]);
         assert_eq!([percent(1.0, 2.0), percent(1.0, 3000.0), percent(0.0, 0.0)], ["50%", "under 0.1%", "100%"]);
     }
 }

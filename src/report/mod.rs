@@ -8,12 +8,11 @@
 //! - `gaussian_kinds` finds the Gaussians at risk.
 //! - `failure` looks at every render of the evaluation for damage to these Gaussians.
 //! - `histogram`, `shown_images` and `film` make histograms, images and animations.
-//! - `page` writes the page, with `cards`, `compare`, `quality` and `details`.
+//! - `page` writes the page, with `overview`, `compare`, `quality` and `details`.
 //!
 //! Memory: the memory of an evaluation or of scoring, which run one after the other, and the page.
 
 mod analysis;
-mod cards;
 pub mod chart;
 mod compare;
 mod details;
@@ -25,6 +24,7 @@ mod findings;
 pub mod gaussian_kinds;
 pub mod histogram;
 mod html;
+mod overview;
 mod page;
 pub mod precision;
 mod quality;
@@ -57,7 +57,7 @@ use crate::scene::Scene;
 pub use findings::{CompressedModelData, ReportData};
 
 use analysis::Analysis;
-use failure::{FailureMode, KindTotals, assess_failure_mode, sum_errors};
+use failure::{FailureMode, KindTotals, assess_failure_mode};
 use findings::WorstPlaceImages;
 use gaussian_kinds::{GaussianKind, KindFlags, contribution_shares, kind_flags};
 use histogram::histograms;
@@ -140,15 +140,15 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
 /// this compressed model. `chosen_renders` lists the renders to show; if it is `None`, this function chooses them.
 /// `render_time` states whether to measure render times.
 fn analyze(options: &EvaluateOptions, chosen_renders: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
-    let mut side = ModelPair::open(options)?;
-    let info = side.scene.source().info();
+    let mut pair = ModelPair::open(options)?;
+    let info = pair.scene.source().info();
     let (count, frames) = (info.count, info.times.len());
-    let run = RunFiles::read_files_beside(&options.compressed, count, side.compressed_count());
-    let mut notes = notes_on(&run, &side.scene)?;
+    let run = RunFiles::read_files_beside(&options.compressed, count, pair.compressed_count());
+    let mut notes = notes_on(&run, &pair.scene)?;
 
     let recipe = recipe_to_score_with(&run)?;
-    let measure = MeasureStages::new(&recipe, side.scene.has_cameras, UserOverrides::default());
-    side.plan_memory(options.original.memory, |work, limits| {
+    let measure = MeasureStages::new(&recipe, pair.scene.has_cameras, UserOverrides::default());
+    pair.plan_memory(options.original.memory, |work, limits| {
         let mut needs = measure.resource_estimates(work, limits, MeasuredOnArrival::default());
         needs.push(gaussian_kinds::resource_estimate(work));
         needs.extend(evaluation::resource_estimates(work, limits).into_iter().map(|mut need| {
@@ -158,40 +158,42 @@ fn analyze(options: &EvaluateOptions, chosen_renders: Option<&[ChosenRender]>, r
         }));
         needs
     })?;
-    let has_cache = side.scene.work.is_enabled();
-    let compared = if has_cache { Some(side.evaluate_as_first_stage()?) } else { None };
-    side.scene.schedule = scored_views(&side.scene, &run)?;
+    let has_cache = pair.scene.work.is_enabled();
+    let compared = if has_cache { Some(pair.evaluate_as_first_stage()?) } else { None };
+    pair.scene.schedule = scored_views(&pair.scene, &run)?;
     if has_cache {
         // The comparison above has the cache key of the command `evaluate`, so both commands share its result. The keys
         // of later stages also depend on the views that score Gaussians, and on the recipe.
-        side.scene.work.depend_on(CacheKey::new(&(&side.scene.schedule, &recipe)));
+        pair.scene.work.depend_on(CacheKey::new(&(&pair.scene.schedule, &recipe)));
     }
-    let scored = measure.measure(&side.scene, None, &mut Journal::default())?;
+    let scored = measure.measure(&pair.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));
-    let find_kinds = || kind_flags(side.scene.source(), &scored, recipe.scan.alpha_min);
-    let kinds = side.scene.work.get_or_compute("traits", side.scene.work.key(&()), find_kinds)?;
+    let find_kinds = || kind_flags(pair.scene.source(), &scored, recipe.scan.alpha_min);
+    let kinds = pair.scene.work.get_or_compute("traits", pair.scene.work.key(&()), find_kinds)?;
     let rows = scored.rows()?;
-    let members = kind_totals(&rows, &kinds, run.fates.as_deref());
-    let look = |state: &Gaussians, camera: &Camera, taken: &RenderedViews| sum_errors(state, &kinds, camera, taken);
-    let (evaluation, seen) = match compared {
-        None => side.observe(look)?,
-        Some(compared) => (compared, side.observe_sharded("failure", look)?),
+    let totals = kind_totals(&rows, &kinds, run.fates.as_deref());
+    let sum_errors = |state: &Gaussians, camera: &Camera, renders: &RenderedViews| {
+        failure::sum_errors(state, &kinds, camera, renders)
     };
-    side.scene.work.end_shard_run_before("the page")?;
+    let (evaluation, error_sums) = match compared {
+        None => pair.observe(sum_errors)?,
+        Some(compared) => (compared, pair.observe_sharded("failure", sum_errors)?),
+    };
+    pair.scene.work.end_shard_run_before("the page")?;
     let names: Vec<(usize, u32)> = evaluation.views.iter().map(|view| (view.frame, view.view)).collect();
     let failure_modes: Vec<FailureMode> = GaussianKind::ALL
         .iter()
-        .zip(members)
-        .map(|(&kind, members)| assess_failure_mode(kind, members, &seen, &names))
+        .zip(totals)
+        .map(|(&kind, totals)| assess_failure_mode(kind, totals, &error_sums, &names))
         .collect();
     let choices =
         chosen_renders.map_or_else(|| choose_renders(&evaluation), |chosen| with_scores_from(&evaluation, chosen));
-    let (shown, close) = show_again(&side, &choices, &failure_modes, &kinds)?;
-    let films = film::render_films(&side, &shown)?;
-    let render_time = if render_time { side.render_time()? } else { None };
+    let (shown, worst_places) = show_again(&pair, &choices, &failure_modes, &kinds)?;
+    let films = film::render_films(&pair, &shown)?;
+    let render_time = if render_time { pair.render_time()? } else { None };
 
     notes.extend(evaluation.notes.iter().cloned());
-    let work_notes = evaluation.work_notes.iter().cloned().chain(side.scene.work.take_notes()).collect();
+    let work_notes = evaluation.work_notes.iter().cloned().chain(pair.scene.work.take_notes()).collect();
     let histograms = match &run.fates {
         Some(fates) => Some(histograms(&rows, &scored.scores(&recipe.score)?, frames, fates)),
         None => None,
@@ -208,7 +210,7 @@ fn analyze(options: &EvaluateOptions, chosen_renders: Option<&[ChosenRender]>, r
         notes,
         work_notes,
     };
-    Ok(Analysis { data, run, shown, films, close })
+    Ok(Analysis { data, run, shown, films, worst_places })
 }
 
 /// Maximum size in bytes of a JSON file of `sweep` or `precision`; a larger file is not read. A file about a thousand
@@ -297,11 +299,6 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
 }
 
 /// Returns the totals of each of the three kinds of Gaussian ([`GaussianKind`]: fast, thin, changing in appearance).
-/// For each kind these are:
-/// - the number of its Gaussians;
-/// - the number of its dropped Gaussians and the number of its merged Gaussians;
-/// - its contribution to renders (Σ alpha · transmittance), as a fraction of the contribution of all Gaussians;
-/// - the contribution of its dropped and merged Gaussians, as a fraction of the contribution of the kind.
 ///
 /// Arguments, each with one entry per Gaussian:
 /// - `rows`: statistics.
@@ -314,7 +311,7 @@ fn kind_totals(rows: &StatisticRows, kinds: &[KindFlags], fates: Option<&[Fate]>
     std::array::from_fn(|kind| {
         let with = |wanted: Fate| (0..kinds.len()).filter(|&i| kinds[i][kind] && fate(i) == wanted).count();
         KindTotals {
-            count: kinds.iter().filter(|of| of[kind]).count(),
+            count: kinds.iter().filter(|flags| flags[kind]).count(),
             fates: fates.map(|_| (with(Fate::Dropped), with(Fate::Merged))),
             shares: shares[kind],
         }
@@ -328,31 +325,31 @@ fn kind_totals(rows: &StatisticRows, kinds: &[KindFlags], fates: Option<&[Fate]>
 ///
 /// `kinds` states for every Gaussian whether it belongs to each kind (fast, thin, changing in appearance).
 fn show_again(
-    side: &ModelPair,
+    pair: &ModelPair,
     choices: &[ChosenRender],
     modes: &[FailureMode],
     kinds: &[KindFlags],
 ) -> Result<(Vec<ShownImage>, Vec<WorstPlaceImages>)> {
-    let worst = || modes.iter().enumerate().filter_map(|(mode, of)| Some((mode, of.worst?.place)));
+    let worst = || modes.iter().enumerate().filter_map(|(number, mode)| Some((number, mode.worst?.place)));
     let places: Vec<usize> = choices.iter().map(|choice| choice.place).chain(worst().map(|(_, place)| place)).collect();
-    let (mut shown, mut close) = (Vec::new(), Vec::new());
-    let made = side.render_views_again(&places, |place, state, camera, taken| {
+    let (mut shown, mut worst_places) = (Vec::new(), Vec::new());
+    let made = pair.render_views_again(&places, |place, state, camera, renders| {
         for choice in choices.iter().filter(|choice| choice.place == place) {
-            shown.push(create_images(choice, &taken)?);
+            shown.push(create_images(choice, &renders)?);
         }
         for (mode, _) in worst().filter(|&(_, at)| at == place) {
             let shares = failure::render_kind_shares(state, kinds, camera);
-            let corner = failure::worst_corner(&taken, &shares, GaussianKind::ALL[mode]);
-            let part = |image| shown_images::data_uri(&failure::crop_square(image, corner));
-            let images = [part(&taken.original)?, part(&taken.compressed)?];
-            close.push(WorstPlaceImages { mode, corner, psnr: failure::crop_psnr(&taken, corner), images });
+            let corner = failure::worst_corner(&renders, &shares, GaussianKind::ALL[mode]);
+            let square = |image| shown_images::png_uri(&failure::crop_square(image, corner));
+            let images = [square(&renders.original)?, square(&renders.compressed)?];
+            worst_places.push(WorstPlaceImages { mode, corner, psnr: failure::crop_psnr(&renders, corner), images });
         }
         Ok(())
     })?;
     made.into_iter().collect::<Result<()>>()?;
     // Renders come back sorted by frame; the page shows them in the order of the choices.
     shown.sort_by_key(|shown| choices.iter().position(|choice| choice.place == shown.choice.place));
-    Ok((shown, close))
+    Ok((shown, worst_places))
 }
 
 /// Writes the report to the output folder of `options`: the HTML page `page`, and data files (JSON and CSV) with the

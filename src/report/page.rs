@@ -3,7 +3,7 @@
 use super::analysis::Analysis;
 use super::document::document;
 use super::html::file_name;
-use super::{cards, compare, details, quality};
+use super::{compare, details, overview, quality};
 use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
 
@@ -17,7 +17,7 @@ const FILM: &str = include_str!("film.js");
 pub(super) fn page(results: &[Analysis], sweep: Option<&TradeOff>, precision: Option<&PrecisionDiagram>) -> String {
     let names = names(results);
     let title = format!("{} – splatsieve report", names.join(", "));
-    let mut out = format!("<header>\n{}</header>\n", cards::header(results, &names));
+    let mut out = format!("<header>\n{}</header>\n", overview::header(results, &names));
     let sections = [
         ("compare", "Before and after", compare::sliders(results, &names)),
         ("motion", "In motion", compare::films(results, &names)),

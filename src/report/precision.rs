@@ -4,13 +4,13 @@
 //! Input: a [`PrecisionDiagram`]. Output: charts as SVG, and a page with charts.
 
 use super::chart::{ChartAxis, Plot, Series};
-use super::document::{document, figure_of, links, list};
-use super::html::{count, escape, figure, file_name};
-use super::trade_off::Chart;
+use super::document::{list, measurements_page};
+use super::html::{escape, figure};
 use crate::evaluation::precision::{
     ADDED_ERROR, KEPT_COUNT_ERROR, KEPT_SET_JACCARD_DISTANCE, PrecisionCurve, PrecisionDiagram, PrecisionKnob,
     PrecisionSetting, RENDER_ERROR, axis_label,
 };
+use crate::progress::grouped;
 
 /// File name of the page that the command `precision` writes.
 pub const PAGE_FILE: &str = "precision.html";
@@ -27,12 +27,7 @@ const WORK: [WorkMeasure; 3] = [
 
 /// Returns the HTML of the page that the command `precision` writes.
 pub fn page(diagram: &PrecisionDiagram) -> String {
-    let title = format!("{} – error against run time", file_name(&diagram.path));
-    let mut body = format!(
-        "<header>\n<h1>Error against run time: {}</h1>\n</header>\n{}",
-        escape(file_name(&diagram.path)),
-        conditions(diagram)
-    );
+    let mut body = conditions(diagram);
     for knob in &diagram.knobs {
         body += &format!(
             "<section>\n<h2>{} <small>({} error)</small></h2>\n{}</section>\n",
@@ -41,12 +36,8 @@ pub fn page(diagram: &PrecisionDiagram) -> String {
             knob_html(knob)
         );
     }
-    body += &format!(
-        "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
-        links(&["precision.json", "precision.csv"]),
-        escape(&diagram.tool)
-    );
-    document(&title, &body, &[])
+    let files = ["precision.json", "precision.csv"];
+    measurements_page("Error against run time", &diagram.path, &body, &files, &diagram.tool)
 }
 
 /// Returns the work-precision diagrams as an HTML section of a report.
@@ -62,13 +53,13 @@ fn conditions(diagram: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \
          keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
-        count(diagram.gaussians),
-        count(diagram.frames),
-        count(diagram.views_scored),
-        count(diagram.frames_scored),
+        grouped(diagram.gaussians),
+        grouped(diagram.frames),
+        grouped(diagram.views_scored),
+        grouped(diagram.frames_scored),
         diagram.judged,
         escape(&diagram.cameras),
-        count(diagram.kept),
+        grouped(diagram.kept),
         diagram.threads,
         diagram.runs,
         diagram.max_setting_seconds,
@@ -79,9 +70,7 @@ fn conditions(diagram: &PrecisionDiagram) -> String {
 /// Returns the HTML of the charts and tables of one knob (group of parameters that were varied).
 fn knob_html(knob: &PrecisionKnob) -> String {
     let mut out = format!("<p>{}</p>\n<div class=\"charts\">\n", escape(&knob.about));
-    for (caption, svg) in charts(knob) {
-        out += &figure_of(&caption, &svg);
-    }
+    out.extend(charts(knob).iter().map(Plot::figure));
     out += "</div>\n";
     for curve in &knob.curves {
         out += &table(curve);
@@ -92,7 +81,7 @@ fn knob_html(knob: &PrecisionKnob) -> String {
 /// Returns the charts of one knob (group of parameters that were varied). Each kind of error has a chart against the
 /// time of all processors; the first kind also has charts against wall time and memory. An error that is always 0 has
 /// no chart.
-pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
+pub fn charts(knob: &PrecisionKnob) -> Vec<Plot> {
     let mut errors: Vec<&String> =
         knob.curves.iter().flat_map(|curve| &curve.settings).flat_map(|m| m.errors.keys()).collect();
     // Errors of renders come first.
@@ -113,14 +102,14 @@ pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
             .any(|mark| mark.errors.get(*error).is_some_and(|&e| e > 0.0))
     };
     let errors: Vec<&String> = errors.into_iter().filter(seen).collect();
-    let mut charts: Vec<Chart> = errors.iter().map(|error| chart(knob, error, WORK[0])).collect();
+    let mut charts: Vec<Plot> = errors.iter().map(|error| chart(knob, error, WORK[0])).collect();
     charts.extend(errors.first().into_iter().flat_map(|error| WORK[1..].iter().map(|&work| chart(knob, error, work))));
     charts
 }
 
 /// Returns the chart of the error called `error` against a measure of work (time or memory) for the settings of `knob`,
 /// both on logarithmic axes.
-fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
+fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Plot {
     let series = knob.curves.iter().map(|curve| {
         let marks: Vec<(&PrecisionSetting, f64, f64)> =
             curve.settings.iter().filter_map(|mark| Some((mark, at(mark)?, *mark.errors.get(error)?))).collect();
@@ -132,11 +121,8 @@ fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
             labels: marks.iter().map(|(mark, ..)| label(curve, mark)).collect(),
         }
     });
-    let log = |label: String| ChartAxis { label, log: true, from_zero: false };
     let title = format!("{}: {}, by {}", knob.name, axis_label(error), work.split(',').next().unwrap_or(work));
-    let plot =
-        Plot { title: title.clone(), x: log(work.to_owned()), y: log(axis_label(error)), series: series.collect() };
-    (title, plot.svg())
+    Plot { title, x: ChartAxis::log(work), y: ChartAxis::log(&axis_label(error)), series: series.collect() }
 }
 
 /// Returns the label of the measurement `mark` in the chart of `curve`: the value of the varied parameter, with a star
@@ -221,7 +207,7 @@ mod tests {
         let marks =
             [4.0, 2.0, 1.0].map(|value| mark(value, &[("C", 0.1 / value), (ADDED_ERROR, 0.2 / value), ("W", 0.0)]));
         let charts = charts(&knob(marks.to_vec()));
-        let titles: Vec<&str> = charts.iter().map(|chart| chart.0.as_str()).collect();
+        let titles: Vec<&str> = charts.iter().map(|chart| chart.title.as_str()).collect();
         assert_eq!(
             titles,
             [
@@ -231,7 +217,7 @@ mod tests {
                 "scoring: error added / error of the model, by peak memory",
             ]
         );
-        for (title, svg) in &charts {
+        for (title, svg) in charts.iter().map(|chart| (&chart.title, chart.svg())) {
             // One of the marks is the legend's.
             assert_eq!(svg.matches("class=\"mark ").count(), 4, "{title}");
             assert!(svg.contains(">2*</text>") && svg.contains(">4</text>"), "{title}: {svg}");

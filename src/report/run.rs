@@ -57,19 +57,17 @@ impl RunFiles {
         let mut run = RunFiles::default();
         let take = |name: &str| companion_path(result, is_folder, name);
         let (summary, recipe, map) = (take(SUMMARY_FILE), take(RECIPE_FILE), take(INDEX_MAP_FILE));
-        match read_summary(&summary) {
-            Ok(found) => run.summary = Some(found),
-            Err(why) => run.missing.push(format!("{}: {why}", shown_name(&summary))),
+        run.summary = run.found(&summary, read_summary(&summary));
+        if let Some((found, has_target)) = run.found(&recipe, read_recipe(&recipe)) {
+            (run.recipe, run.has_target) = (Some(found), has_target);
         }
-        match read_recipe(&recipe) {
-            Ok((found, has_target)) => (run.recipe, run.has_target) = (Some(found), has_target),
-            Err(why) => run.missing.push(format!("{}: {why}", shown_name(&recipe))),
-        }
-        match read_fates(&map, original, compressed) {
-            Ok(found) => run.fates = Some(found),
-            Err(why) => run.missing.push(format!("{}: {why}", shown_name(&map))),
-        }
+        run.fates = run.found(&map, read_fates(&map, original, compressed));
         run
+    }
+
+    /// Returns the content `read` of the file `path`. If it cannot be used, adds the reason to the missing files.
+    fn found<T>(&mut self, path: &Path, read: Result<T, String>) -> Option<T> {
+        read.map_err(|why| self.missing.push(format!("{}: {why}", shown_name(path)))).ok()
     }
 }
 

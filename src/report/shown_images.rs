@@ -138,7 +138,7 @@ pub fn create_images(choice: &ChosenRender, renders: &RenderedViews) -> Result<S
         ("photograph", renders.truth.as_ref()),
     ] {
         if let Some(image) = image {
-            images.push((name, data_uri(&shrink(image, shrunk))?));
+            images.push((name, png_uri(&shrink(image, shrunk))?));
         }
     }
     let size = (renders.original.width.div_ceil(shrunk), renders.original.height.div_ceil(shrunk));
@@ -149,10 +149,14 @@ pub fn create_images(choice: &ChosenRender, renders: &RenderedViews) -> Result<S
 ///
 /// # Errors
 /// Fails if the image has no pixels.
-pub fn data_uri(image: &Image) -> Result<String> {
-    let bytes = image_bytes(image, ImageFormat::Png)
-        .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;
-    Ok(format!("data:image/png;base64,{}", STANDARD.encode(bytes)))
+pub fn png_uri(image: &Image) -> Result<String> {
+    data_uri("png", image_bytes(image, ImageFormat::Png))
+}
+
+/// Returns a data URI that contains `bytes`, an image file of the media type image/`kind`.
+pub(super) fn data_uri(kind: &str, bytes: io::Result<Vec<u8>>) -> Result<String> {
+    let bytes = bytes.map_err(|error| Error::internal(format!("an image cannot be encoded: {error}")))?;
+    Ok(format!("data:image/{kind};base64,{}", STANDARD.encode(bytes)))
 }
 
 /// Returns the absolute difference |a − b| of two images, channel by channel; values are first clamped to [0, 1].
@@ -244,10 +248,10 @@ mod tests {
 
     #[test]
     fn a_uri_holds_the_image() {
-        let uri = data_uri(&image(5, 4, |i| i as f32 / 60.0)).unwrap();
+        let uri = png_uri(&image(5, 4, |i| i as f32 / 60.0)).unwrap();
         let bytes = STANDARD.decode(uri.strip_prefix("data:image/png;base64,").unwrap()).unwrap();
         let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
         assert_eq!((reader.info().width, reader.info().height), (5, 4));
-        assert!(data_uri(&image(0, 0, |_| 0.0)).is_err());
+        assert!(png_uri(&image(0, 0, |_| 0.0)).is_err());
     }
 }

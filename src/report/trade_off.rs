@@ -1,20 +1,18 @@
 //! Charts and page of a sweep, which measures several methods at several sizes: quality against number of Gaussians,
 //! bytes, time and memory.
 //!
-//! Input: a [`TradeOff`]. Output: charts as SVG, whose colors come from [`super::chart::STYLE`], and pages with charts.
+//! Input: a [`TradeOff`]. Output: charts and pages with charts.
 
 use super::chart::{ChartAxis, Plot, Series};
-use super::document::{document, figure_of, links, list};
-use super::html::{bytes, count, escape, figure, file_name};
+use super::document::{list, measurements_page};
+use super::html::{escape, figure};
 use crate::evaluation::method::Method;
 use crate::evaluation::trade_off::{EffortCurve, TradeOff, TradeOffPoint};
 use crate::pipeline::summary::GoalSummary;
+use crate::progress::{decimal_bytes, grouped};
 
 /// File name of the page that the command `sweep` writes.
 pub const PAGE_FILE: &str = "sweep.html";
-
-/// Chart: its caption, and its `<svg>` element.
-pub type Chart = (String, String);
 
 /// Function that returns the x or the y coordinate of a measurement in a chart; `None` if it is not known.
 type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
@@ -23,15 +21,8 @@ type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 pub fn page(trade_off: &TradeOff) -> String {
     let mut files = vec!["sweep.json", "sweep.csv"];
     files.extend((!trade_off.knobs.is_empty()).then_some("knobs.csv"));
-    let body = format!(
-        "<header>\n<h1>What quality costs: {}</h1>\n</header>\n<section>\n{}</section>\n\
-         <p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
-        escape(file_name(&trade_off.path)),
-        section(trade_off),
-        links(&files),
-        escape(&trade_off.tool)
-    );
-    document(&format!("{} – what quality costs", file_name(&trade_off.path)), &body, &[])
+    let body = format!("<section>\n{}</section>\n", section(trade_off));
+    measurements_page("What quality costs", &trade_off.path, &body, &files, &trade_off.tool)
 }
 
 /// Returns an HTML section with a description of the sweep, its charts and its notes.
@@ -44,14 +35,12 @@ pub(super) fn section(trade_off: &TradeOff) -> String {
         "<p class=\"note\">{}: {} Gaussians, {}; {} renders, {} threads{runs}. Lines go from few Gaussians to \
          many.{pair}</p>\n<div class=\"charts\">\n",
         escape(&trade_off.path),
-        count(trade_off.gaussians),
-        bytes(trade_off.bytes),
+        grouped(trade_off.gaussians),
+        decimal_bytes(trade_off.bytes),
         trade_off.views,
         trade_off.threads
     );
-    for (caption, svg) in charts(trade_off) {
-        out += &figure_of(&caption, &svg);
-    }
+    out.extend(charts(trade_off).iter().map(Plot::figure));
     out + "</div>\n" + &list(&trade_off.notes)
 }
 
@@ -72,13 +61,13 @@ pub(super) fn search(goal: &GoalSummary) -> String {
         },
     ];
     let title = format!("Sizes that the run tried for --{}", goal.name.replace('_', "-"));
-    let plot = Plot { title: title.clone(), x: log("Gaussians"), y: linear(what), series };
-    format!("<div class=\"charts\">\n{}</div>\n", figure_of(&title, &plot.svg()))
+    let plot = Plot { title, x: ChartAxis::log("Gaussians"), y: ChartAxis::linear(what), series };
+    format!("<div class=\"charts\">\n{}</div>\n", plot.figure())
 }
 
 /// Returns all charts of a sweep: quality against size, time and memory with a series per method, and a chart of error
 /// against run time for each varied parameter.
-pub fn charts(trade_off: &TradeOff) -> Vec<Chart> {
+pub fn charts(trade_off: &TradeOff) -> Vec<Plot> {
     let curves = curves(trade_off);
     let kept = |point: &TradeOffPoint| Some(100.0 * trade_off.kept_fraction(point));
     let megabytes = |point: &TradeOffPoint| Some(point.bytes as f64 / 1e6);
@@ -94,8 +83,9 @@ pub fn charts(trade_off: &TradeOff) -> Vec<Chart> {
             paired: curve.paired,
             labels: Vec::new(),
         });
-        (title.to_owned(), Plot { title: title.to_owned(), x, y, series: series.collect() }.svg())
+        Plot { title: title.to_owned(), x, y, series: series.collect() }
     };
+    let (linear, log) = (ChartAxis::linear, ChartAxis::log);
     let mut charts = vec![
         plot("PSNR by kept Gaussians", linear("Gaussians kept, %"), linear("PSNR, dB"), [&kept, &psnr], true),
         plot("SSIM by kept Gaussians", linear("Gaussians kept, %"), linear("SSIM"), [&kept, &ssim], true),
@@ -111,7 +101,7 @@ pub fn charts(trade_off: &TradeOff) -> Vec<Chart> {
 
 /// Returns the chart of error against run time with a mark for each tried value of the parameter `knob`. For
 /// comparison, the chart also has a mark for the same method without refinement, at the same number of Gaussians.
-fn effort_chart(knob: &EffortCurve, trade_off: &TradeOff) -> Chart {
+fn effort_chart(knob: &EffortCurve, trade_off: &TradeOff) -> Plot {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
     let is_beside = |point: &&TradeOffPoint| {
@@ -136,8 +126,7 @@ fn effort_chart(knob: &EffortCurve, trade_off: &TradeOff) -> Chart {
     }));
     let kept = first.map_or(1.0, |point| trade_off.kept_fraction(point));
     let title = format!("Error by run time, {}% kept, by {}", figure(100.0 * kept), knob.parameter);
-    let (x, y) = (log("time to compress, s"), log(ERROR));
-    (title.clone(), Plot { title, x, y, series }.svg())
+    Plot { title, x: ChartAxis::log("time to compress, s"), y: ChartAxis::log(ERROR), series }
 }
 
 /// Axis label of the values that [`error`] returns.
@@ -146,14 +135,6 @@ const ERROR: &str = "root mean square error";
 /// Returns the root mean square error, of colors in [0, 1], that corresponds to the mean PSNR of `point`.
 fn error(point: &TradeOffPoint) -> f64 {
     10f64.powf(-point.psnr / 20.0)
-}
-
-fn linear(label: &str) -> ChartAxis {
-    ChartAxis { label: label.to_owned(), ..ChartAxis::default() }
-}
-
-fn log(label: &str) -> ChartAxis {
-    ChartAxis { label: label.to_owned(), log: true, from_zero: false }
 }
 
 /// Measurements of one method in a sweep.
@@ -239,9 +220,10 @@ mod tests {
         ];
         let charts = charts(&found(points, Vec::new()));
         // Two marks of every chart belong to the legend.
-        assert_eq!(charts.iter().map(|chart| marks(&chart.1) - 2).collect::<Vec<_>>(), [3, 3, 3, 3, 3, 3, 2]);
-        assert!(charts.iter().all(|chart| chart.1.contains(">random</text>")));
-        assert_eq!(charts[0].1.matches("<polyline").count(), 1, "a single point has no line");
+        let svg: Vec<String> = charts.iter().map(Plot::svg).collect();
+        assert_eq!(svg.iter().map(|svg| marks(svg) - 2).collect::<Vec<_>>(), [3, 3, 3, 3, 3, 3, 2]);
+        assert!(svg.iter().all(|svg| svg.contains(">random</text>")));
+        assert_eq!(svg[0].matches("<polyline").count(), 1, "a single point has no line");
     }
 
     #[test]
@@ -264,9 +246,9 @@ mod tests {
         let points = vec![point("no-refine", 10, 15.0, None), other_size, point("random", 10, 5.0, None)];
         let found = found(points, vec![knob]);
         let charts = charts(&found);
-        let (title, svg) = &charts[6];
-        assert_eq!(title, "Error by run time, 10% kept, by refine_steps");
-        assert_eq!(marks(svg), 2 + 3, "the legend's two, the knob's two and no-refine at this size: {svg}");
+        let svg = charts[6].svg();
+        assert_eq!(charts[6].title, "Error by run time, 10% kept, by refine_steps");
+        assert_eq!(marks(&svg), 2 + 3, "the legend's two, the knob's two and no-refine at this size: {svg}");
         assert!(svg.contains(">100</text>") && svg.contains(">1500</text>"), "{svg}");
         let page = page(&found);
         assert!(page.contains("knobs.csv") && page.contains("medians of 3 runs") && !page.contains("<b>"), "{page}");

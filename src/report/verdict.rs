@@ -4,6 +4,7 @@ use super::failure::{FailureMode, Verdict};
 use super::html::percent;
 use crate::evaluation::results::Evaluation;
 use crate::metrics::PSNR_CAP_DB;
+use crate::progress::counted;
 
 /// Words of the verdict for the quality, each with the lowest mean PSNR in dB at which they are used. The root mean
 /// square error is below 1/255 from 50 dB on, below 3/255 at 40 dB, 8/255 at 30 dB and 16/255 at 24 dB.
@@ -24,12 +25,11 @@ pub(super) fn verdict(evaluation: &Evaluation, modes: &[FailureMode]) -> String 
     let words =
         WORDS.iter().find(|(from, _)| mean.psnr >= *from).map_or("cannot be compared with the original", |w| w.1);
     let mut text = format!(
-        "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {} render{}",
+        "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {}",
         of(evaluation.count.compressed as u64, evaluation.count.original as u64),
         of(evaluation.bytes.compressed, evaluation.bytes.original),
         mean.psnr,
-        mean.pairs,
-        if mean.pairs == 1 { "" } else { "s" },
+        counted(mean.pairs, "render"),
     );
     if let Some(worst) = evaluation.worst_render().filter(|_| mean.pairs > 1) {
         text += &format!(", {:.1} dB in the worst, frame {} of view {}", worst.loss.psnr, worst.frame, worst.view);

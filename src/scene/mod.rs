@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
-use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Throughput, Workload};
+use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Rig, Split, ViewSchedule};
 use crate::models::{InputModel, TimeOrigin};
 use crate::progress::Events;
@@ -65,9 +65,6 @@ pub struct Scene {
     /// Maximum number of times that the run reads the whole input, according to the memory plan that set `limits`;
     /// `None` before a plan is made.
     pub planned_reads: Option<f64>,
-    /// Measured times of this machine for this scene, as multiples of the times that are assumed for planning. Later
-    /// stages multiply their estimates by these factors.
-    pub pace: Throughput,
     /// Folder for temporary files during the run.
     pub scratch: PathBuf,
     /// Cache of stage results. A disabled cache stores nothing.
@@ -113,7 +110,6 @@ impl Scene {
             background,
             limits: Limits::NONE,
             planned_reads: None,
-            pace: Throughput::UNKNOWN,
             scratch: std::env::temp_dir(),
             work: Cache::disabled(),
             digest: None,
@@ -125,9 +121,7 @@ impl Scene {
 
     /// Returns the properties of the scene from which memory and time are estimated.
     pub fn workload(&self) -> Workload {
-        let work =
-            Workload::new(self.source().info(), self.input.memory_profile()).with_views(&self.rig, &self.schedule);
-        Workload { throughput: self.pace, ..work }
+        Workload::new(self.source().info(), self.input.memory_profile()).with_views(&self.rig, &self.schedule)
     }
 
     /// Plans the memory of the stages whose estimates `needs` returns, and makes this scene keep to the limits of the

@@ -2,7 +2,7 @@
 //! failures to write.
 
 use std::collections::BTreeMap;
-use std::ffi::CString;
+use std::ffi::{CString, OsStr};
 use std::fs::{self, File};
 use std::io::Read;
 use std::os::unix::ffi::OsStrExt;
@@ -151,6 +151,16 @@ fn ordinary_user(folder: &Folder) -> impl Fn(&mut Command) {
             command.uid(NOBODY);
         }
     }
+}
+
+#[test]
+fn json_names_an_output_that_is_not_utf_8() {
+    let folder = Folder::new();
+    write_input(&folder);
+    let output = OsStr::from_bytes(b"x\xff.gseq");
+    let words = ["convert", "in.ply", "--json"].map(OsStr::new);
+    let outcome = folder.attack_with(words.into_iter().chain([output])).run().succeeded();
+    assert!(outcome.stdout.contains("x\u{fffd}.gseq"), "{}", outcome.stdout);
 }
 
 #[test]

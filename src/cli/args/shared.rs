@@ -8,7 +8,6 @@ use super::choices::{LINK_MODES, ROTATION_LAYOUTS, SPLITS, ZERO_ROTATIONS, choic
 use super::values::{parse_bytes, parse_duration, parse_scratch_folder, parse_size, parse_times};
 use super::{CACHE, CAMERAS, MACHINE};
 use splatsieve::cache::Shard;
-use splatsieve::files::atomic::Replace;
 use splatsieve::files::cameras::TimesSource;
 use splatsieve::models::{LinkMode, ZeroRotation};
 use splatsieve::scene::view_selection::ViewSet;
@@ -68,19 +67,15 @@ pub(in crate::cli) struct CacheArgs {
     pub(in crate::cli) shard: Option<Shard>,
 }
 
-/// Policy for an output path that already exists.
+/// Options for the results of a command.
 #[derive(Debug, Args)]
-pub(in crate::cli) struct Earlier {
+pub(in crate::cli) struct ResultFlags {
+    /// Print JSON
+    #[arg(long)]
+    pub(in crate::cli) json: bool,
     /// Replace an output file that exists; in a folder, replace the files of an earlier result and keep all others
     #[arg(long)]
     pub(in crate::cli) overwrite: bool,
-}
-
-impl Earlier {
-    /// Returns whether existing output files may be replaced (`--overwrite`), as the library's type [`Replace`].
-    pub(in crate::cli) fn replace(&self) -> Replace {
-        if self.overwrite { Replace::Existing } else { Replace::Never }
-    }
 }
 
 /// Memory limit.

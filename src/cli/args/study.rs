@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::values::parse_ratio;
-use super::{Background, CameraFile, Earlier, Input, RecipeFlags};
+use super::{Background, CameraFile, Input, RecipeFlags, ResultFlags};
 use splatsieve::diagnostics::precision::Knob;
 use splatsieve::evaluation::method::Method;
 
@@ -45,10 +45,7 @@ pub(in crate::cli) struct Sweep {
     #[arg(short, long, value_name = "FOLDER")]
     pub(in crate::cli) output: PathBuf,
     #[command(flatten)]
-    pub(in crate::cli) earlier: Earlier,
-    /// Print JSON
-    #[arg(long)]
-    pub(in crate::cli) json: bool,
+    pub(in crate::cli) results: ResultFlags,
 }
 
 /// Arguments of `precision`.
@@ -79,10 +76,7 @@ pub(in crate::cli) struct PrecisionArgs {
     #[arg(short, long, value_name = "FOLDER")]
     pub(in crate::cli) output: PathBuf,
     #[command(flatten)]
-    pub(in crate::cli) earlier: Earlier,
-    /// Print JSON
-    #[arg(long)]
-    pub(in crate::cli) json: bool,
+    pub(in crate::cli) results: ResultFlags,
     #[command(flatten)]
     pub(in crate::cli) recipe: RecipeFlags,
 }

@@ -28,51 +28,31 @@ const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 /// Description, in the results, of the reference with which sums are compared.
 const AGAINST: &str = "f64, compensated";
 
-/// Running sum of numbers of type `T`, which are added one after the other.
-trait Sum<T: Float>: Default {
-    fn add(&mut self, value: T);
-    fn total(self) -> f64;
+/// Running sum of numbers of type `T`, which are added one after the other. A compensated sum (Kahan) also holds the
+/// rounding error that the rounded sum contains, and subtracts it from the next value.
+struct RunningSum<T> {
+    sum: T,
+    /// Rounding error of `sum`; 0 if the sum is not compensated.
+    error: T,
+    is_compensated: bool,
 }
 
-/// Plain sum: rounding errors are not corrected.
-struct Plain<T>(T);
-
-/// Kahan's compensated sum: the rounded sum, and the rounding error that it contains, which is subtracted from the next
-/// value.
-struct Compensated<T>(T, T);
-
-impl<T: Float> Default for Plain<T> {
-    fn default() -> Self {
-        Plain(T::zero())
+impl<T: Float> RunningSum<T> {
+    fn new(is_compensated: bool) -> Self {
+        RunningSum { sum: T::zero(), error: T::zero(), is_compensated }
     }
-}
 
-impl<T: Float> Default for Compensated<T> {
-    fn default() -> Self {
-        Compensated(T::zero(), T::zero())
-    }
-}
-
-impl<T: Float> Sum<T> for Plain<T> {
     fn add(&mut self, value: T) {
-        self.0 = self.0 + value;
+        let value = value - self.error;
+        let sum = self.sum + value;
+        if self.is_compensated {
+            self.error = (sum - self.sum) - value;
+        }
+        self.sum = sum;
     }
 
-    fn total(self) -> f64 {
-        to_f64(self.0)
-    }
-}
-
-impl<T: Float> Sum<T> for Compensated<T> {
-    fn add(&mut self, value: T) {
-        let value = value - self.1;
-        let sum = self.0 + value;
-        self.1 = (sum - self.0) - value;
-        self.0 = sum;
-    }
-
-    fn total(self) -> f64 {
-        to_f64(self.0) - to_f64(self.1)
+    fn total(&self) -> f64 {
+        to_f64(self.sum) - to_f64(self.error)
     }
 }
 
@@ -114,12 +94,10 @@ impl Bench<'_> {
         }
         let decoded: Vec<Decoded> = states.iter().map(Decoded::from_state).collect();
         let mut curves = Vec::new();
-        type Variant = (&'static str, fn(&[Decoded], usize) -> SummedStatistics);
-        let variants: [Variant; 2] =
-            [("f32", sum_statistics::<f32, Plain<f32>>), ("f32, compensated", sum_statistics::<f32, Compensated<f32>>)];
-        let expected = PLAYED.map(|frames_played| sum_statistics::<f64, Compensated<f64>>(&decoded, frames_played));
-        for (name, sum) in variants {
-            let marks = self.measure_lengths(&expected, |frames_played| Ok(sum(&decoded, frames_played)))?;
+        let expected = PLAYED.map(|frames_played| sum_statistics::<f64>(&decoded, frames_played, true));
+        for (name, is_compensated) in [("f32", false), ("f32, compensated", true)] {
+            let sums = |frames_played| Ok(sum_statistics::<f32>(&decoded, frames_played, is_compensated));
+            let marks = self.measure_lengths(&expected, sums)?;
             curves.push(PrecisionCurve::new(name, AGAINST, marks, None, &[]));
         }
         let marks =
@@ -184,8 +162,8 @@ impl Decoded {
 
 /// Computes trajectory magnitude D, curvature κ and opacity variance V of every Gaussian over a sequence of
 /// `frames_played` frames, which plays `states` forward and backward. Gaussians count as alive in all frames. Numbers
-/// have the type `T` and are added by the sum `S`.
-fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize) -> SummedStatistics {
+/// have the type `T`. `is_compensated`: whether their sums are compensated.
+fn sum_statistics<T: Float>(states: &[Decoded], frames_played: usize, is_compensated: bool) -> SummedStatistics {
     let count = states.first().map_or(0, |state| state.opacity.len());
     let length2 = |v: [T; 3]| v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
     let difference = |a: [T; 3], b: [T; 3]| -> [T; 3] { std::array::from_fn(|axis| a[axis] - b[axis]) };
@@ -193,7 +171,7 @@ fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize)
         let at = |k: usize| &states[ping_pong_index(k, states.len())];
         let position = |k: usize| at(k).position[i].map(|x| from_f64::<T>(f64::from(x)));
         let first: T = from_f64(at(0).opacity[i]);
-        let (mut steps, mut turns, mut shifted, mut squares) = (S::default(), S::default(), S::default(), S::default());
+        let [mut steps, mut turns, mut shifted, mut squares] = [(); 4].map(|()| RunningSum::<T>::new(is_compensated));
         let mut before: Option<[T; 3]> = None;
         for k in 0..frames_played {
             let opacity = from_f64::<T>(at(k).opacity[i]) - first;
@@ -257,12 +235,12 @@ mod tests {
         let mean = levels.iter().sum::<f64>() / 17.0;
         let v = levels.iter().map(|a| (a - mean).powi(2)).sum::<f64>() / 17.0;
         let variants = [
-            sum_statistics::<f32, Plain<f32>>,
-            sum_statistics::<f32, Compensated<f32>>,
-            sum_statistics::<f64, Compensated<f64>>,
+            sum_statistics::<f32>(&states, 17, false),
+            sum_statistics::<f32>(&states, 17, true),
+            sum_statistics::<f64>(&states, 17, true),
         ];
-        for (variant, sum) in variants.into_iter().enumerate() {
-            let [found_d, found_kappa, found_v] = sum(&states, 17).map(|values| values[0]);
+        for (variant, found) in variants.into_iter().enumerate() {
+            let [found_d, found_kappa, found_v] = found.map(|values| values[0]);
             for (found, expected) in [(found_d, d), (found_kappa, kappa), (found_v, v)] {
                 assert!((found - expected).abs() < 1e-6 * expected, "variant {variant}: {found}, expected {expected}");
             }
@@ -271,7 +249,7 @@ mod tests {
 
     #[test]
     fn compensated_sums_keep_what_plain_ones_lose() {
-        let (mut plain, mut compensated) = (Plain::<f32>::default(), Compensated::<f32>::default());
+        let [mut plain, mut compensated] = [false, true].map(RunningSum::<f32>::new);
         for _ in 0..1_000_000 {
             plain.add(0.1);
             compensated.add(0.1);

@@ -26,15 +26,17 @@ pub struct CaseResult {
 }
 
 impl CaseResult {
+    /// Runs the case `name`, whose function `measure` adds the error of every compared value to its argument.
     pub(super) fn new(
         name: &'static str,
         what: &'static str,
         bound: f64,
-        measure: impl FnOnce() -> Result<LargestError>,
+        measure: impl FnOnce(&mut LargestError) -> Result<()>,
     ) -> CaseResult {
+        let mut worst = LargestError::default();
         // A panic is caught, so that the other cases still run.
-        let (error, failure) = match catch_unwind(AssertUnwindSafe(measure)) {
-            Ok(Ok(LargestError(error))) => (error, None),
+        let (error, failure) = match catch_unwind(AssertUnwindSafe(|| measure(&mut worst))) {
+            Ok(Ok(())) => (worst.0, None),
             Ok(Err(error)) => (f64::INFINITY, Some(error.to_string())),
             Err(_) => (f64::INFINITY, Some("a panic".to_owned())),
         };

@@ -28,37 +28,43 @@ use crate::TOOL;
 use crate::error::{Error, Result};
 
 pub use case::CaseResult;
+use case::LargestError;
 
-/// List of the cases of the self-check, in the order of the pipeline. Each function runs one case.
-const CASES: [fn() -> CaseResult; 28] = [
-    statistics::motion,
-    statistics::motion_far_away,
-    statistics::motion_of_any_size,
-    statistics::uneven_frames,
-    statistics::short_lives,
-    statistics::steady_opacity,
-    statistics::projected_area,
-    statistics::needle_on_screen,
-    score::percentiles,
-    score::robust_box,
-    merging::mixture,
-    merging::needle,
-    merging::proxy,
-    merging::duplicates,
-    field::states,
-    field::derivative,
-    renders::one_gaussian,
-    renders::many_gaussians,
-    renders::weights,
-    renders::removal,
-    renders::harmonics,
-    renders::gradients,
-    renders::comparison,
-    storage::container,
-    storage::bounded_container,
-    storage::archive_grid,
-    storage::archive_codes,
-    threads::same_bytes,
+/// Case of the self-check. The fields are, in order: its name, what it compares, the bound of its error, and the
+/// function that adds the error of every compared value to its argument.
+type Case = (&'static str, &'static str, f64, fn(&mut LargestError) -> Result<()>);
+
+/// List of the cases of the self-check, in the order of the pipeline. The documentation of each function gives the
+/// reason of the bound.
+const CASES: [Case; 28] = [
+    ("motion and life", "D, κ, V, life: definition, f64", 1e-13, statistics::motion),
+    ("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, statistics::motion_far_away),
+    ("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, statistics::motion_of_any_size),
+    ("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, statistics::uneven_frames),
+    ("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, statistics::short_lives),
+    ("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, statistics::steady_opacity),
+    ("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, statistics::projected_area),
+    ("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, statistics::needle_on_screen),
+    ("percentiles", "nearest ranks: the sorted values", 0.0, score::percentiles),
+    ("extent of a scene", "P1, P50, P99: the sorted values", 0.0, score::robust_box),
+    ("mixture", "mean, covariance: Σ formed in f64", 1e-13, merging::mixture),
+    ("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, merging::needle),
+    ("proxy of five", "mass, mean, covariance, color: f64", 1e-10, merging::proxy),
+    ("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, merging::duplicates),
+    ("deformation field", "states: planes, layers in f64", 5e-6, field::states),
+    ("field's derivative", "of positions: differences in f64", 1e-5, field::derivative),
+    ("one Gaussian", "its render: closed form (of white)", 3e-7, renders::one_gaussian),
+    ("many Gaussians", "their render: f64 (of white)", 2e-6, renders::many_gaussians),
+    ("contributions", "C, W as seen: sums in f64 (px)", 2e-6, renders::weights),
+    ("removal errors", "renders without one: f64 (px)", 5e-6, renders::removal),
+    ("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, renders::harmonics),
+    ("backward pass", "derivatives: differences in f64", 5e-5, renders::gradients),
+    ("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, renders::comparison),
+    ("container", "values of 70 frames: the same bits", 0.0, storage::container),
+    ("container in bounds", "values: within 1 bound of theirs", 1.0, storage::bounded_container),
+    ("archive's grid", "values: within ½ step of theirs", 1.0, storage::archive_grid),
+    ("archive's codes", "symbols and bytes: the same", 0.0, storage::archive_codes),
+    ("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, threads::same_bytes),
 ];
 
 /// Results of all cases of the self-check.
@@ -77,7 +83,7 @@ pub struct SelfcheckReport {
 /// Runs all cases of the self-check and returns their results.
 pub fn run() -> SelfcheckReport {
     let start = Instant::now();
-    let cases: Vec<CaseResult> = CASES.iter().map(|case| case()).collect();
+    let cases = CASES.map(|(name, what, bound, measure)| CaseResult::new(name, what, bound, measure)).into();
     SelfcheckReport::new(cases, start.elapsed().as_secs_f64())
 }
 
@@ -128,7 +134,6 @@ fn short_number(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::case::LargestError;
     use super::*;
 
     #[test]
@@ -147,20 +152,21 @@ mod tests {
 
     #[test]
     fn large_errors_nan_errors_and_panics_fail_a_case() {
-        let case = |error| CaseResult::new("made up", "nothing", 1e-9, || Ok(error));
-        let nan = || {
-            let mut worst = LargestError::default();
+        let case = |error| {
+            CaseResult::new("made up", "nothing", 1e-9, |worst| {
+                worst.add(error);
+                Ok(())
+            })
+        };
+        let nan = CaseResult::new("made up", "nothing", 1e-9, |worst| {
             worst.near(f64::NAN, 0.0, 1.0);
             worst.near(0.0, 0.0, 1.0);
-            worst
-        };
-        let refused = CaseResult::new("refused", "nothing", 1e-9, || Err(Error::usage("no disk")));
-        let idle = CaseResult::new("idle", "nothing", 1e-9, || Ok(LargestError::default()));
-        let panics = CaseResult::new("panics", "nothing", 1e-9, || panic!("as it should"));
-        let report = SelfcheckReport::new(
-            vec![case(LargestError(1e-9)), case(LargestError(1.1e-9)), case(nan()), refused, panics, idle],
-            0.5,
-        );
+            Ok(())
+        });
+        let refused = CaseResult::new("refused", "nothing", 1e-9, |_| Err(Error::usage("no disk")));
+        let idle = CaseResult::new("idle", "nothing", 1e-9, |_| Ok(()));
+        let panics = CaseResult::new("panics", "nothing", 1e-9, |_| panic!("as it should"));
+        let report = SelfcheckReport::new(vec![case(1e-9), case(1.1e-9), nan, refused, panics, idle], 0.5);
         let passes: Vec<bool> = report.cases.iter().map(|case| case.pass).collect();
         assert_eq!((passes, report.pass), (vec![true, false, false, false, false, false], false));
         let text = report.text();

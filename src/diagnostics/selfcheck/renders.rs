@@ -5,9 +5,10 @@ use std::num::NonZeroU32;
 
 use glam::DVec3;
 
-use super::case::{CaseResult, LargestError};
+use super::case::LargestError;
 use super::generated::clouds::{Random, plain_camera, random_gaussians, single_gaussian, tilted_camera};
 use super::oracle::render::{blended_indices, render_blended, render_view};
+use crate::error::Result;
 use crate::metrics::{psnr, ssim};
 use crate::model::{Attributes, Camera, Gaussians, Gradients};
 use crate::render::{Contribution, Image, RemovalError, Renderer, render};
@@ -20,181 +21,154 @@ const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 /// - Pixel: r px from the center of the Gaussian
 /// - Camera: focal length f px
 ///
-/// In f32, values of 1 have an error of 6e-8, and exponentials a little more. Returns the largest error, with the bound
-/// that it must not exceed.
-pub(super) fn one_gaussian() -> CaseResult {
-    CaseResult::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
-        let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
-        let image =
-            render(&single_gaussian(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
-        let variance = (50.0 * scale / depth).powi(2) + 0.3;
-        let middle = f64::from(size) / 2.0 - 0.5;
-        let mut worst = LargestError::default();
-        for (at, pixel) in image.data.chunks_exact(3).enumerate() {
-            let [x, y] = [at % size as usize, at / size as usize].map(|k| k as f64 - middle);
-            let alpha = opacity * (-0.5 * (x * x + y * y) / variance).exp();
-            let alpha = if alpha < 1.0 / 255.0 { 0.0 } else { alpha };
-            for (&got, color) in pixel.iter().zip([1.0, 0.5, 0.0]) {
-                worst.near(got.into(), alpha * color + (1.0 - alpha) * 0.25, 1.0);
-            }
+/// In f32, values of 1 have an error of 6e-8, and exponentials a little more.
+pub(super) fn one_gaussian(worst: &mut LargestError) -> Result<()> {
+    let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
+    let image = render(&single_gaussian(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
+    let variance = (50.0 * scale / depth).powi(2) + 0.3;
+    let middle = f64::from(size) / 2.0 - 0.5;
+    for (at, pixel) in image.data.chunks_exact(3).enumerate() {
+        let [x, y] = [at % size as usize, at / size as usize].map(|k| k as f64 - middle);
+        let alpha = opacity * (-0.5 * (x * x + y * y) / variance).exp();
+        let alpha = if alpha < 1.0 / 255.0 { 0.0 } else { alpha };
+        for (&got, color) in pixel.iter().zip([1.0, 0.5, 0.0]) {
+            worst.near(got.into(), alpha * color + (1.0 - alpha) * 0.25, 1.0);
         }
-        Ok(worst)
-    })
+    }
+    Ok(())
 }
 
 /// Compares a render of many Gaussians with the same render in f64, pixel by pixel. The program adds a few dozen values
 /// per pixel in f32. Skips the few pixels in which f32 may decide differently, because alpha or transmittance of a
-/// Gaussian is so close to a threshold of the renderer (relative difference below 1e-4). Returns the largest error,
-/// with the bound that it must not exceed.
-pub(super) fn many_gaussians() -> CaseResult {
-    CaseResult::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
-        let (scene, camera) = (random_gaussians(1, 300, 3), tilted_camera(67, 45));
-        let expected = render_view(&scene, &camera, BACKGROUND, 1);
-        let got = render(&scene, &camera, BACKGROUND);
-        let sure = expected.doubtful.iter().filter(|&&doubtful| !doubtful).count();
-        let mut worst = LargestError::default();
-        worst.same(&(20 * sure > 19 * expected.doubtful.len()), &true);
-        for (at, rgb) in expected.rgb.iter().enumerate().filter(|&(at, _)| !expected.doubtful[at]) {
-            (0..3).for_each(|c| worst.near(got.data[3 * at + c].into(), rgb[c], 1.0));
-        }
-        Ok(worst)
-    })
+/// Gaussian is so close to a threshold of the renderer (relative difference below 1e-4).
+pub(super) fn many_gaussians(worst: &mut LargestError) -> Result<()> {
+    let (scene, camera) = (random_gaussians(1, 300, 3), tilted_camera(67, 45));
+    let expected = render_view(&scene, &camera, BACKGROUND, 1);
+    let got = render(&scene, &camera, BACKGROUND);
+    let sure = expected.doubtful.iter().filter(|&&doubtful| !doubtful).count();
+    worst.same(&(20 * sure > 19 * expected.doubtful.len()), &true);
+    for (at, rgb) in expected.rgb.iter().enumerate().filter(|&(at, _)| !expected.doubtful[at]) {
+        (0..3).for_each(|c| worst.near(got.data[3 * at + c].into(), rgb[c], 1.0));
+    }
+    Ok(())
 }
 
 /// Compares the sum and the maximum of alpha · transmittance over the pixels, for each Gaussian, with values computed
-/// in f64. Errors of the sum are relative to 1 + sum. The program sums in f32 over a tile of 256 pixels. Returns the
-/// largest error, with the bound that it must not exceed.
-pub(super) fn weights() -> CaseResult {
-    CaseResult::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
-        let (scene, camera) = undoubtful_scene();
-        let expected = render_view(&scene, &camera, BACKGROUND, 1);
-        let mut seen = Contribution::new(scene.len());
-        Renderer::new().contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
-        let mut worst = LargestError::default();
-        for i in 0..scene.len() {
-            worst.near(seen.in_pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
-            worst.near(seen.max[i].into(), expected.max[i], 1.0);
-        }
-        Ok(worst)
-    })
+/// in f64. Errors of the sum are relative to 1 + sum. The program sums in f32 over a tile of 256 pixels.
+pub(super) fn weights(worst: &mut LargestError) -> Result<()> {
+    let (scene, camera) = undoubtful_scene();
+    let expected = render_view(&scene, &camera, BACKGROUND, 1);
+    let mut seen = Contribution::new(scene.len());
+    Renderer::new().contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
+    for i in 0..scene.len() {
+        worst.near(seen.in_pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
+        worst.near(seen.max[i].into(), expected.max[i], 1.0);
+    }
+    Ok(())
 }
 
 /// Compares the removal error of each Gaussian with its definition, Σ‖render − render without the Gaussian‖² over the
 /// pixels, where both renders are in f64. The program computes the color behind a Gaussian as a difference in f32.
-/// Returns the largest error, with the bound that it must not exceed.
-pub(super) fn removal() -> CaseResult {
-    CaseResult::new("removal errors", "renders without one: f64 (px)", 5e-6, || {
-        let (scene, camera) = undoubtful_scene();
-        let mut found = RemovalError::new(scene.len(), 0.0);
-        Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);
-        let all = blended_indices(&scene, &camera);
-        let whole = render_blended(&scene, &camera, BACKGROUND, &all);
-        let mut worst = LargestError::default();
-        for i in 0..scene.len() {
-            let others: Vec<Vec<usize>> =
-                all.iter().map(|ids| ids.iter().copied().filter(|&id| id != i).collect()).collect();
-            let without = render_blended(&scene, &camera, BACKGROUND, &others);
-            let values = whole.as_flattened().iter().zip(without.as_flattened());
-            let expected: f64 = values.map(|(a, b)| (a - b).powi(2)).sum();
-            worst.near(found.sum[i] as f64 * RemovalError::SUM_UNIT, expected, 1.0 + expected);
-        }
-        Ok(worst)
-    })
+pub(super) fn removal(worst: &mut LargestError) -> Result<()> {
+    let (scene, camera) = undoubtful_scene();
+    let mut found = RemovalError::new(scene.len(), 0.0);
+    Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);
+    let all = blended_indices(&scene, &camera);
+    let whole = render_blended(&scene, &camera, BACKGROUND, &all);
+    for i in 0..scene.len() {
+        let others: Vec<Vec<usize>> =
+            all.iter().map(|ids| ids.iter().copied().filter(|&id| id != i).collect()).collect();
+        let without = render_blended(&scene, &camera, BACKGROUND, &others);
+        let values = whole.as_flattened().iter().zip(without.as_flattened());
+        let expected: f64 = values.map(|(a, b)| (a - b).powi(2)).sum();
+        worst.near(found.sum[i] as f64 * RemovalError::SUM_UNIT, expected, 1.0 + expected);
+    }
+    Ok(())
 }
 
 /// Compares colors that the program computes from SH coefficients with the definition of the spherical harmonics by
 /// angles, K·P(cos θ)·cos mφ. The Legendre functions P come from a recurrence; K is the normalization. A color of 1 has
-/// an error of about 1e-7 in f32. Returns the largest error, with the bound that it must not exceed.
-pub(super) fn harmonics() -> CaseResult {
-    CaseResult::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
-        let mut worst = LargestError::default();
-        for toward in [DVec3::new(0.3, -0.5, 0.8), DVec3::new(-0.7, 0.2, -0.4), DVec3::new(0.1, 0.9, 0.05)] {
-            let toward = toward.normalize();
-            let camera = Camera::look_at(DVec3::ZERO, toward, 1.0, (8, 8));
-            let mut wall = Gaussians::zeros(1, 3);
-            wall.position.set_row(0, toward.to_array().map(|x| 4.0 * x as f32));
-            wall.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
-            wall.log_scale.set_row(0, [9.0; 3]);
-            // The wall lets through a hundredth of the light behind it, because alpha is clamped to 0.99.
-            wall.opacity_logit.set_row(0, [9.0]);
-            for (k, expected) in basis(toward).into_iter().enumerate() {
-                wall.sh.planes_mut().fill(0.0);
-                (0..3).for_each(|c| wall.sh.plane_mut(3 * k + c)[0] = 0.3 * (c as f32 - 1.0));
-                let image = render(&wall, &camera, [0.0; 3]);
-                for c in 0..3 {
-                    let color = 0.5 + f64::from(0.3 * (c as f32 - 1.0)) * expected;
-                    worst.near(image.data[3 * (8 * 4 + 4) + c].into(), 0.99 * color, 1.0);
-                }
+/// an error of about 1e-7 in f32.
+pub(super) fn harmonics(worst: &mut LargestError) -> Result<()> {
+    for toward in [DVec3::new(0.3, -0.5, 0.8), DVec3::new(-0.7, 0.2, -0.4), DVec3::new(0.1, 0.9, 0.05)] {
+        let toward = toward.normalize();
+        let camera = Camera::look_at(DVec3::ZERO, toward, 1.0, (8, 8));
+        let mut wall = Gaussians::zeros(1, 3);
+        wall.position.set_row(0, toward.to_array().map(|x| 4.0 * x as f32));
+        wall.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
+        wall.log_scale.set_row(0, [9.0; 3]);
+        // The wall lets through a hundredth of the light behind it, because alpha is clamped to 0.99.
+        wall.opacity_logit.set_row(0, [9.0]);
+        for (k, expected) in basis(toward).into_iter().enumerate() {
+            wall.sh.planes_mut().fill(0.0);
+            (0..3).for_each(|c| wall.sh.plane_mut(3 * k + c)[0] = 0.3 * (c as f32 - 1.0));
+            let image = render(&wall, &camera, [0.0; 3]);
+            for c in 0..3 {
+                let color = 0.5 + f64::from(0.3 * (c as f32 - 1.0)) * expected;
+                worst.near(image.data[3 * (8 * 4 + 4) + c].into(), 0.99 * color, 1.0);
             }
         }
-        Ok(worst)
-    })
+    }
+    Ok(())
 }
 
 /// Compares the 20 largest gradients of each attribute with finite differences. A gradient is the derivative of half
 /// the squared error of a render with respect to one parameter. A finite difference is computed from the errors of two
 /// f64 renders, whose values of the parameter differ by 6e-5. Errors are relative to the expected gradient; the
-/// gradients of the program are f32 sums of terms of both signs. Returns the largest error, with the bound that it must
-/// not exceed.
-pub(super) fn gradients() -> CaseResult {
-    CaseResult::new("backward pass", "derivatives: differences in f64", 5e-5, || {
-        let (scene, camera) = (random_gaussians(3, 40, 3), tilted_camera(33, 100));
-        let doubtful = render_view(&scene, &camera, BACKGROUND, 1).doubtful;
-        let mut random = Random(103);
-        let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.next_f32().into()).collect();
-        let residual = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
-        let mut found = Gradients::new(scene.len(), Attributes::all(), 3);
-        let slope = |image: &Image| {
-            let data = image.data.iter().enumerate().map(|(at, &x)| residual(at, x.into()) as f32).collect();
-            (0.0, Image { data, ..*image })
-        };
-        Renderer::new().gradient(&scene, &camera, BACKGROUND, slope, &mut found);
+/// gradients of the program are f32 sums of terms of both signs.
+pub(super) fn gradients(worst: &mut LargestError) -> Result<()> {
+    let (scene, camera) = (random_gaussians(3, 40, 3), tilted_camera(33, 100));
+    let doubtful = render_view(&scene, &camera, BACKGROUND, 1).doubtful;
+    let mut random = Random(103);
+    let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.next_f32().into()).collect();
+    let residual = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
+    let mut found = Gradients::new(scene.len(), Attributes::all(), 3);
+    let slope = |image: &Image| {
+        let data = image.data.iter().enumerate().map(|(at, &x)| residual(at, x.into()) as f32).collect();
+        (0.0, Image { data, ..*image })
+    };
+    Renderer::new().gradient(&scene, &camera, BACKGROUND, slope, &mut found);
 
-        // The list of Gaussians that each pixel blends is fixed beforehand, so that the loss is smooth.
-        let blended = blended_indices(&scene, &camera);
-        let loss = |changed: &Gaussians| -> f64 {
-            let pixels = render_blended(changed, &camera, BACKGROUND, &blended);
-            let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| residual(at, x).powi(2));
-            0.5 * squares.sum::<f64>()
-        };
-        let mut worst = LargestError::default();
-        for column in Attributes::all().iter() {
-            let got = found.derivatives(column).planes();
-            let mut largest: Vec<usize> = (0..got.len()).collect();
-            largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
-            for &at in largest.iter().take(20) {
-                let mut changed = scene.clone();
-                let middle = scene.attribute_values(column).planes()[at];
-                let both = [middle - 3e-5, middle + 3e-5];
-                let [low, high] = both.map(|x| {
-                    changed.attribute_values_mut(column).planes_mut()[at] = x;
-                    loss(&changed)
-                });
-                worst.relative(got[at].into(), (high - low) / (f64::from(both[1]) - f64::from(both[0])));
-            }
+    // The list of Gaussians that each pixel blends is fixed beforehand, so that the loss is smooth.
+    let blended = blended_indices(&scene, &camera);
+    let loss = |changed: &Gaussians| -> f64 {
+        let pixels = render_blended(changed, &camera, BACKGROUND, &blended);
+        let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| residual(at, x).powi(2));
+        0.5 * squares.sum::<f64>()
+    };
+    for column in Attributes::all().iter() {
+        let got = found.derivatives(column).planes();
+        let mut largest: Vec<usize> = (0..got.len()).collect();
+        largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
+        for &at in largest.iter().take(20) {
+            let mut changed = scene.clone();
+            let middle = scene.attribute_values(column).planes()[at];
+            let both = [middle - 3e-5, middle + 3e-5];
+            let [low, high] = both.map(|x| {
+                changed.attribute_values_mut(column).planes_mut()[at] = x;
+                loss(&changed)
+            });
+            worst.relative(got[at].into(), (high - low) / (f64::from(both[1]) - f64::from(both[0])));
         }
-        Ok(worst)
-    })
+    }
+    Ok(())
 }
 
 /// Compares PSNR in dB with its value from an exact sum of squared whole numbers, and SSIM with its definition. The f64
-/// sums of 786,432 squares lose at most 1e-12. Returns the largest error, with the bound that it must not exceed.
-pub(super) fn comparison() -> CaseResult {
-    CaseResult::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
-        let mut random = Random(8);
-        let mut image = |size: u32| -> (Image, Vec<i64>) {
-            let levels: Vec<i64> = (0..3 * size * size).map(|_| (256.0 * random.next_f32()) as i64).collect();
-            let data = levels.iter().map(|&level| level as f32 / 256.0).collect();
-            (Image { width: size, height: size, data }, levels)
-        };
-        let ((a, levels), (b, others)) = (image(512), image(512));
-        let squares: i64 = levels.iter().zip(&others).map(|(a, b)| (a - b).pow(2)).sum();
-        let mut worst = LargestError::default();
-        worst.near(psnr(&a, &b), -10.0 * (squares as f64 / 65536.0 / levels.len() as f64).log10(), 1.0);
-        let ((a, _), (b, _)) = (image(16), image(16));
-        worst.near(ssim(&a, &b), reference_ssim(&a, &b), 1.0);
-        Ok(worst)
-    })
+/// sums of 786,432 squares lose at most 1e-12.
+pub(super) fn comparison(worst: &mut LargestError) -> Result<()> {
+    let mut random = Random(8);
+    let mut image = |size: u32| -> (Image, Vec<i64>) {
+        let levels: Vec<i64> = (0..3 * size * size).map(|_| (256.0 * random.next_f32()) as i64).collect();
+        let data = levels.iter().map(|&level| level as f32 / 256.0).collect();
+        (Image { width: size, height: size, data }, levels)
+    };
+    let ((a, levels), (b, others)) = (image(512), image(512));
+    let squares: i64 = levels.iter().zip(&others).map(|(a, b)| (a - b).pow(2)).sum();
+    worst.near(psnr(&a, &b), -10.0 * (squares as f64 / 65536.0 / levels.len() as f64).log10(), 1.0);
+    let ((a, _), (b, _)) = (image(16), image(16));
+    worst.near(ssim(&a, &b), reference_ssim(&a, &b), 1.0);
+    Ok(())
 }
 
 /// Seed of the random Gaussians of [`undoubtful_scene`]. With this seed, no alpha or transmittance in the render of the

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use gseq::Compression;
 
-use super::case::{CaseResult, LargestError};
+use super::case::LargestError;
 use super::generated::clouds::{Random, random_gaussians};
 use crate::archive::{
     ATTRIBUTES, ArchiveContent, EncodedArchive, FieldSteps, QuantizationSteps, TensorRole, TensorSteps,
@@ -23,87 +23,69 @@ use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Writes frames to a lossless container, reads them back, and compares every bit. The values include NaN and −0, and
-/// rotations that are the same in the last frame of a block of frames as in its first frame. Returns the largest error,
-/// with the bound that it must not exceed.
-pub(super) fn container() -> CaseResult {
-    CaseResult::new("container", "values of 70 frames: the same bits", 0.0, || {
-        let mut worst = LargestError::default();
-        let written = MemoryFrames::new();
-        for compression in [Compression::Raw, Compression::Zstd(1)] {
-            compare_round_trip(&written, compression, |got, expected, _| {
-                worst.same(&got.to_bits(), &expected.to_bits())
-            })?;
-        }
-        Ok(worst)
-    })
+/// rotations that are the same in the last frame of a block of frames as in its first frame.
+pub(super) fn container(worst: &mut LargestError) -> Result<()> {
+    let written = MemoryFrames::new();
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
+        compare_round_trip(&written, compression, |got, expected, _| worst.same(&got.to_bits(), &expected.to_bits()))?;
+    }
+    Ok(())
 }
 
 /// Writes frames to a container with error bounds, reads them back, and compares the values. The unit of the error is
-/// the requested bound of the attribute. Returns the largest error, with the bound that it must not exceed.
-pub(super) fn bounded_container() -> CaseResult {
-    CaseResult::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
-        let mut worst = LargestError::default();
-        let mut written = MemoryFrames::new();
-        for column in written.frames.iter_mut().flat_map(|frame| frame.selected_attribute_values_mut(Attributes::all()))
-        {
-            column.planes_mut().iter_mut().filter(|x| !x.is_finite()).for_each(|x| *x = 0.0);
-        }
-        let requested = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
-        let requested: Vec<MaxError> =
-            requested.iter().map(|text| text.parse()).collect::<std::result::Result<_, _>>().map_err(Error::usage)?;
-        let bounds = ErrorBounds::from_errors(&requested, || Ok(1.0))?;
-        compare_round_trip(&written, Packing::with_bounds(bounds, 3), |got, expected, column| {
-            worst.near(got.into(), expected.into(), bounds.max_error(column));
-        })?;
-        Ok(worst)
-    })
+/// the requested bound of the attribute.
+pub(super) fn bounded_container(worst: &mut LargestError) -> Result<()> {
+    let mut written = MemoryFrames::new();
+    for column in written.frames.iter_mut().flat_map(|frame| frame.selected_attribute_values_mut(Attributes::all())) {
+        column.planes_mut().iter_mut().filter(|x| !x.is_finite()).for_each(|x| *x = 0.0);
+    }
+    let requested = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
+    let requested: Vec<MaxError> =
+        requested.iter().map(|text| text.parse()).collect::<std::result::Result<_, _>>().map_err(Error::usage)?;
+    let bounds = ErrorBounds::from_errors(&requested, || Ok(1.0))?;
+    compare_round_trip(&written, Packing::with_bounds(bounds, 3), |got, expected, column| {
+        worst.near(got.into(), expected.into(), bounds.max_error(column));
+    })?;
+    Ok(())
 }
 
 /// Encodes a model as an archive, decodes it, and compares the decoded values with the originals. The unit of the error
-/// is half a quantization step plus a rounding to f32. Returns the largest error, with the bound that it must not
-/// exceed.
-pub(super) fn archive_grid() -> CaseResult {
-    CaseResult::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
-        let (content, steps) = model();
-        let EncodedArchive { bytes, order, .. } = encode(&content, &steps)?;
-        let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
-        let expected = content.cloud.pick(&order);
-        let mut worst = LargestError::default();
-        let half = |k: i32, value: f32| 0.5 * step_size(k) + f64::from(value.abs()) * f64::from(f32::EPSILON);
-        for (k, &step) in steps.cloud.iter().enumerate().take(used_attributes(&content)) {
-            for (got, expected) in attribute_values(&back.cloud, k).zip(attribute_values(&expected, k)) {
-                worst.near(got.into(), expected.into(), half(step, expected));
-            }
+/// is half a quantization step plus a rounding to f32.
+pub(super) fn archive_grid(worst: &mut LargestError) -> Result<()> {
+    let (content, steps) = model();
+    let EncodedArchive { bytes, order, .. } = encode(&content, &steps)?;
+    let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
+    let expected = content.cloud.pick(&order);
+    let half = |k: i32, value: f32| 0.5 * step_size(k) + f64::from(value.abs()) * f64::from(f32::EPSILON);
+    for (k, &step) in steps.cloud.iter().enumerate().take(used_attributes(&content)) {
+        for (got, expected) in attribute_values(&back.cloud, k).zip(attribute_values(&expected, k)) {
+            worst.near(got.into(), expected.into(), half(step, expected));
         }
-        let matrix =
-            |content: &ArchiveContent| content.tensors.get("a.matrix").map_or(Vec::new(), |tensor| tensor.data.clone());
-        let (got, expected) = (matrix(&back), matrix(&content));
-        worst.same(&(back.cloud.len(), got.len()), &(content.cloud.len(), expected.len()));
-        got.iter().zip(expected).for_each(|(&got, x)| worst.near(got.into(), x.into(), half(MATRIX_STEP, x)));
-        Ok(worst)
-    })
+    }
+    let matrix =
+        |content: &ArchiveContent| content.tensors.get("a.matrix").map_or(Vec::new(), |tensor| tensor.data.clone());
+    let (got, expected) = (matrix(&back), matrix(&content));
+    worst.same(&(back.cloud.len(), got.len()), &(content.cloud.len(), expected.len()));
+    got.iter().zip(expected).for_each(|(&got, x)| worst.near(got.into(), x.into(), half(MATRIX_STEP, x)));
+    Ok(())
 }
 
 /// Encodes a model as an archive, decodes it, and compares every bit, because the prediction and entropy coding of an
 /// archive are lossless. The decoded Gaussians must equal the original Gaussians after rounding to the quantization
-/// grid. The other stored data must equal the originals. Returns the largest error, with the bound that it must not
-/// exceed.
-pub(super) fn archive_codes() -> CaseResult {
-    CaseResult::new("archive's codes", "symbols and bytes: the same", 0.0, || {
-        let (content, steps) = model();
-        let EncodedArchive { bytes, order, .. } = encode(&content, &steps)?;
-        let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
-        let mut expected = content.cloud.pick(&order);
-        let attributes: Vec<usize> = (0..used_attributes(&content)).collect();
-        round_cloud(&mut expected, &steps.cloud, &attributes);
-        let mut worst = LargestError::default();
-        worst.same(&back.cloud, &expected);
-        worst.same(&back.files, &content.files);
-        worst.same(&back.tensors.get("a.exact"), &content.tensors.get("a.exact"));
-        let extra_bytes: Vec<u8> = order.iter().map(|&id| content.extra_bytes[id as usize]).collect();
-        worst.same(&back.extra_bytes, &extra_bytes);
-        Ok(worst)
-    })
+/// grid. The other stored data must equal the originals.
+pub(super) fn archive_codes(worst: &mut LargestError) -> Result<()> {
+    let (content, steps) = model();
+    let EncodedArchive { bytes, order, .. } = encode(&content, &steps)?;
+    let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
+    let mut expected = content.cloud.pick(&order);
+    let attributes: Vec<usize> = (0..used_attributes(&content)).collect();
+    round_cloud(&mut expected, &steps.cloud, &attributes);
+    worst.same(&back.cloud, &expected);
+    worst.same(&back.files, &content.files);
+    worst.same(&back.tensors.get("a.exact"), &content.tensors.get("a.exact"));
+    let extra_bytes: Vec<u8> = order.iter().map(|&id| content.extra_bytes[id as usize]).collect();
+    worst.same(&back.extra_bytes, &extra_bytes);
+    Ok(())
 }
 
 /// Quantization step of the matrix of the test model, given as its binary logarithm in eighths: the step is 2^(−60/8).

@@ -37,7 +37,6 @@ pub(crate) struct Degree {
 /// lower the SH degree.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_sh_degree()) {
-        stages.set_uncertain_duration();
         stages.add(Phase::Rank, Degree { refine: refine.with_step_fraction(TRIAL_STEPS) });
     }
 }

@@ -23,7 +23,7 @@ use crate::files::atomic::ScratchFolder;
 use crate::journal::Journal;
 use crate::journal::records::{QualitySummary, RenderTime, ViewKind};
 use crate::limits::Limits;
-use crate::memory_plan::{RENDER_COST, ResourceEstimate, Throughput, Workload, bytes_of_survivors};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, Workload, bytes_of_survivors};
 use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
 use crate::model::{Attributes, FrameView};
 use crate::models::InputModel;
@@ -264,7 +264,7 @@ impl QualityStage {
     /// views is the same on every machine.
     fn view_count(&self, run: &RunState<'_>) -> usize {
         let scene = run.scene;
-        let work = Workload { throughput: Throughput::UNKNOWN, ..scene.workload() };
+        let work = scene.workload();
         let output_fraction = run.result.len() as f64 / work.gaussian_count().max(1.0);
         let input = EstimateInput {
             work: &work,

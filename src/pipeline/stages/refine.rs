@@ -32,13 +32,6 @@ impl Stage for RefineStage {
         format!("refine: {steps} steps at the end, {steps_per_prune} before a prune step, toward {views} views")
     }
 
-    /// Returns whether refinement may be unnecessary: the run removes so few Gaussians that the PSNR of renders against
-    /// the original may stay above 60 dB without it. `hardly_seen`: fraction of the Gaussians that can be removed
-    /// before the PSNR falls below 60 dB.
-    fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
-        input.output_fraction >= 1.0 - hardly_seen
-    }
-
     fn describe_shardable_work(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
         vec![format!("{}: views", targets::NAME)]
     }

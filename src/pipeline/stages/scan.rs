@@ -56,8 +56,7 @@ impl ScanStage {
         ResourceEstimate {
             stage: NAME,
             reads: if work.frames == 0 { 1.0 } else { frames_read / work.frames as f64 },
-            seconds: work.throughput.states
-                * work.gaussian_count()
+            seconds: work.gaussian_count()
                 * frames_read
                 * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
                 + work.reading_seconds(work.gaussian_count(), frames_read),

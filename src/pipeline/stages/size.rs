@@ -55,11 +55,7 @@ pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
 /// requested. An archive needs no such stage, because its quantization steps are adapted to the size.
 pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
-        let repeats = planning.refine.is_some();
-        if repeats {
-            stages.set_uncertain_duration();
-        }
-        stages.add(Phase::Reduce, ShrinkToBytes { limit, repeats });
+        stages.add(Phase::Reduce, ShrinkToBytes { limit, repeats: planning.refine.is_some() });
     }
 }
 
