@@ -111,8 +111,8 @@ pub(super) struct Compress {
     #[command(flatten)]
     pub(super) format: OutputFormat,
     /// PSNR of renders of an archive (NAME.gsz) against renders of the same result without quantization, such as 45dB
-    /// [default: 9 dB above the PSNR of the result against the original, at most 50 dB; quantization then lowers the
-    /// PSNR against the original by about 0.5 dB]
+    /// [default: about 9 dB above the PSNR of the result against the original, so that quantization lowers the latter by
+    /// at most 0.5 dB; 50 dB if the result has 50 dB or more]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]

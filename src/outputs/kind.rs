@@ -104,7 +104,7 @@ impl OutputKind {
              NAME.spz       one frame, for most web viewers\n  \
              NAME.sog       one frame as images, for web viewers\n  \
              NAME.glb       one frame, for viewers of glTF\n  \
-             NAME.tsog      linear motion in windows of time, the smallest for web viewers\n  \
+             NAME.tsog      linear motion in windows of time, SH degree 0 to 3\n  \
              NAME.ftgs.ply  linear motion in windows of time, for ftgs-player\n  \
              NAME.gsd       every frame whole, for Unreal\n  \
              a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \

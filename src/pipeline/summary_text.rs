@@ -231,8 +231,12 @@ impl Summary {
             // The archive would have all SH degrees, because only its quantization removes colors.
             let has_dropped =
                 |bands: &ShDegreeSummary| bands.tried.iter().any(|(degree, _)| *degree >= bands.sh_degree);
-            let folder = if self.bands.as_ref().is_some_and(has_dropped) { "a model" } else { "the same" };
-            writeln!(out, "Smaller:  -o {} writes an archive, which unpacks to {folder} folder", beside(".gsz"))?;
+            let degrees = if self.bands.as_ref().is_some_and(has_dropped) { " of all SH degrees" } else { "" };
+            writeln!(
+                out,
+                "Smaller:  -o {} writes an archive; convert restores a model folder{degrees} from it",
+                beside(".gsz")
+            )?;
         }
         Ok(())
     }

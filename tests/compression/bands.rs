@@ -41,10 +41,13 @@ fn write_faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
 const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --set field=exact --overwrite";
 
 #[test]
-fn archives_unpack_to_the_same_folder_only_without_dropped_degrees() {
+fn archives_restore_dropped_degrees_and_say_so() {
     let workplace = Workplace::new();
     write_faint_above(&workplace, 1);
-    for (bands, says) in [("needed", "unpacks to a model folder"), ("all", "unpacks to the same folder")] {
+    for (bands, says) in [
+        ("needed", "convert restores a model folder of all SH degrees"),
+        ("all", "convert restores a model folder from it"),
+    ] {
         let said = workplace
             .done(&format!("compress {QUICKLY} --ratio 0.5 --set bands={bands} --set bands_margin=90 -o small"));
         assert!(said.contains(says), "{bands}: {said}");

@@ -81,11 +81,7 @@ pub(super) const OUTPUT_KINDS: Choices<OutputKind> = &[
     ("sog", "One frame as images, for web viewers (.sog)", OutputKind::Sog),
     ("glb", "One frame, uncompressed, for viewers of glTF (.glb)", OutputKind::Glb),
     ("sog-sequence", "Folder with one .sog per frame, for the flip book of PlayCanvas", OutputKind::SogSequence),
-    (
-        "tsog",
-        "Gaussians with linear motion in time windows as images, the smallest for web viewers (.tsog)",
-        OutputKind::Tsog,
-    ),
+    ("tsog", "Gaussians with linear motion in time windows as images, SH degree 0 to 3 (.tsog)", OutputKind::Tsog),
     ("ftgs", "Gaussians with linear motion in time windows, for ftgs-player (.ftgs.ply)", OutputKind::Ftgs),
     ("gsd", "Every frame in full, for SplatRenderer of Unreal (.gsd)", OutputKind::Gsd),
 ];

@@ -15,8 +15,9 @@ use splatsieve::scene::view_selection::ViewSet;
 /// Input of a command.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Input {
-    /// Trained model (folder or checkpoint of any supported trainer), folder of PLY frames, .ply, .splatv, .gsz or
-    /// .gseq file, or `-` for a frame stream on standard input. See docs/inputs.md
+    /// Trained model (folder or checkpoint of any supported trainer), folder with one file per frame, a single file (.ply,
+    /// .splatv, .tsog, .ftgs.ply, .spz, .sog, .splat, .glb, .gsz or .gseq), or `-` for a frame stream on standard input.
+    /// See docs/inputs.md
     pub(in crate::cli) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K", hide_short_help = true)]
@@ -84,7 +85,7 @@ pub(in crate::cli) struct Memory {
     /// Memory limit, such as 512MiB or 4GB [default: a quarter of the memory that this process may use: the smallest of
     /// the machine's memory and the limits of its control group, its Slurm or Windows job, and ulimit]
     ///
-    /// The limit does not change the result, except that refinement is reduced or left out if it needs more; the
+    /// The limit does not change the result, except that `compress` reduces or leaves out refinement if it needs more; the
     /// summary says so.
     #[arg(long, help_heading = MACHINE, value_name = "SIZE", value_parser = parse_bytes)]
     pub(in crate::cli) memory: Option<u64>,

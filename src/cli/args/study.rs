@@ -18,7 +18,8 @@ pub(in crate::cli) struct Sweep {
     pub(in crate::cli) cameras: CameraFile,
     /// Methods to compare. default, paper: the presets. no-refine: default without refinement. paper-prune: paper
     /// without merging. paper-merge: paper without pruning. visible, projected, opacity, scale: pruning by visible
-    /// contribution, projected coverage, opacity or scale alone. random: pruning at random
+    /// contribution, projected coverage, opacity or scale alone. random: pruning at random. With the default fractions, all
+    /// methods are up to 55 runs
     #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
           value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
     pub(in crate::cli) methods: Vec<String>,
@@ -32,8 +33,7 @@ pub(in crate::cli) struct Sweep {
     /// Fraction of the Gaussians to keep with --steps
     #[arg(long, value_name = "FRACTION", default_value_t = 0.1, requires = "steps")]
     pub(in crate::cli) steps_at: f64,
-    /// Number of runs per method and fraction; the reported time is their median. By default up to 55 complete runs: 10
-    /// methods at 5 fractions, and 5 methods also at the size that they choose
+    /// Number of runs per method and fraction; the reported time is their median
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
     pub(in crate::cli) repeat: u32,
     /// Maximum number of frames to compare, spread evenly
