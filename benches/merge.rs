@@ -2,9 +2,8 @@
 //!
 //! The benchmarks `neighbors` measure the time per Gaussian of finding the nearest neighbors within the radius ε. The
 //! inputs are trained models with ε of the presets, evenly distributed Gaussians with few or many neighbors (`strewn`),
-//! clusters, and crowds (all in one voxel, or all at one point). Four methods are compared:
-//! - `voxels`: the index that the program uses, built and searched.
-//! - `tree`: one tree over all points, searched in voxel order, which the program used earlier.
+//! clusters, and crowds (all within ε, or all at one point). Three methods are compared:
+//! - `tree`: the index that the program uses, built and searched.
 //! - `all_pairs`: comparison of all pairs; only for few Gaussians.
 //! - `plain_hash`: a hash table of voxels with lists of their points; the voxels are looked up for each point.
 //!
@@ -32,8 +31,7 @@ use splatsieve::merging::motion::{MotionThresholds, PairMotionAccumulator};
 use splatsieve::merging::motion_pass::PairMeter;
 use splatsieve::merging::neighbors::PointIndex;
 use splatsieve::merging::proxy::Importance;
-use splatsieve::merging::tree::{NearestPoints, Tree, TreePoint};
-use splatsieve::merging::voxels::voxel_order;
+use splatsieve::merging::tree::TreePoint;
 use splatsieve::merging::{RequestedPairs, Survivors};
 use splatsieve::model::hash_id;
 use splatsieve::model::{AttributeValues, Attributes, Gaussians};
@@ -73,24 +71,10 @@ fn points(position: &AttributeValues) -> Vec<TreePoint> {
     (0..position.len()).map(|i| TreePoint { position: position.row(i), index: i as u32 }).collect()
 }
 
-fn by_voxels(position: &AttributeValues, epsilon: f64) -> usize {
+fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {
     let index = PointIndex::new(points(position), epsilon);
     let mut search = index.search();
     index.points().iter().map(|point| search.nearest(point.index, point.position, NEIGHBORS).0.len()).sum()
-}
-
-fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {
-    let rows: Vec<u32> = (0..position.len() as u32).collect();
-    let order = voxel_order(&rows, |row| position.row(row as usize), epsilon);
-    let mut points = points(position);
-    let tree = Tree::new(&mut points);
-    let mut nearest = NearestPoints::default();
-    let mut count_neighbors = |row: u32| {
-        nearest.start_query(row, position.row(row as usize), NEIGHBORS + 1, epsilon);
-        tree.search(&points, &mut nearest);
-        nearest.sort_by_distance().len().min(NEIGHBORS)
-    };
-    order.into_iter().map(&mut count_neighbors).sum()
 }
 
 fn squared(a: [f32; 3], b: [f32; 3]) -> f64 {
@@ -182,12 +166,12 @@ fn neighbors(criterion: &mut Criterion) {
         cases.push((format!("clustered {n}"), clustered(n), 0.001));
         cases.push((format!("clustered densely {n}"), clustered(n), 0.01));
     }
-    cases.push(("one voxel".into(), evenly_distributed(100_000).0.position, 2.0));
+    cases.push(("all near".into(), evenly_distributed(100_000).0.position, 2.0));
     cases.push(("one point".into(), AttributeValues::zeros(3, 100_000), 0.1));
     for (name, position, epsilon) in cases {
         let mut group = criterion.benchmark_group(format!("neighbors/{name}"));
         group.sample_size(10).throughput(Throughput::Elements(position.len() as u64));
-        let mut rivals: Vec<(&str, Find)> = vec![("voxels", by_voxels), ("tree", by_tree)];
+        let mut rivals: Vec<(&str, Find)> = vec![("tree", by_tree)];
         if name.starts_with("strewn") && position.len() <= 100_000 {
             rivals.push(("plain_hash", by_plain_hash));
         }
@@ -252,15 +236,9 @@ fn motion(criterion: &mut Criterion) {
     group.sample_size(10).throughput(Throughput::Elements((48 * pairs.len()) as u64));
     for partitions in [1, 8] {
         let measure = || {
-            let mut meter = PairMeter {
-                source: &container,
-                scan: &recipe.scan,
-                gate: MotionThresholds::new(&recipe.merge, 4.0),
-                max_kept_frames: usize::MAX,
-                scratch: folder.path().to_owned(),
-                events: Events::IGNORED,
-                gathered: None,
-            };
+            let thresholds = MotionThresholds::new(&recipe.merge, 4.0);
+            let scratch = folder.path().to_owned();
+            let mut meter = PairMeter::new(&container, &recipe.scan, thresholds, usize::MAX, scratch, Events::IGNORED);
             let parts = pairs.chunks(pairs.len().div_ceil(partitions));
             parts
                 .map(|part| meter.measure(&ids, &reference, part.to_vec(), 0.05, partitions > 1).unwrap().len())
@@ -292,7 +270,7 @@ fn whole(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("merge");
     group.sample_size(10).throughput(Throughput::Elements(n as u64));
     group.bench_function("pass", |bencher| {
-        bencher.iter(|| one_thread.install(|| merging::run(&survivors, &recipe, None, usize::MAX, alike)));
+        bencher.iter(|| one_thread.install(|| merging::merge_survivors(&survivors, &recipe, None, usize::MAX, alike)));
     });
 }
 

@@ -47,15 +47,9 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
         pairs.extend(near.filter(|&j| i < j).map(|j| (i, j)));
     }
     let recipe = Recipe::preset("default").unwrap();
-    let mut meter = PairMeter {
-        source: &container,
-        scan: &recipe.scan,
-        gate: MotionThresholds::new(&recipe.merge, 4.0),
-        max_kept_frames: FRAMES_HELD,
-        scratch: folder.to_owned(),
-        events: Events::IGNORED,
-        gathered: None,
-    };
+    let thresholds = MotionThresholds::new(&recipe.merge, 4.0);
+    let mut meter =
+        PairMeter::new(&container, &recipe.scan, thresholds, FRAMES_HELD, folder.to_owned(), Events::IGNORED);
     let count = pairs.len();
     let measure = || {
         let mut found = Vec::with_capacity(count);

@@ -47,8 +47,8 @@ use tree::TreePoint;
 
 /// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. The terms are, in
 /// order: the groups before the pass, the groups after it, the row of the survivor's state, its rank, and 46 bytes for
-/// the largest of three structures that exist one after the other. These are the neighbor index (46 bytes), the list of
-/// coincident nodes (24), and the clustering (24).
+/// the largest of three structures that exist one after the other. These are the neighbor index (46 bytes while it is
+/// built, 30 later), the list of coincident nodes (24), and the clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, the callback that measures the motion of pairs; memory
@@ -149,8 +149,8 @@ pub struct PassCounts {
 /// # Calls of `measure`
 ///
 /// Each pass calls `measure` at most twice: first for the pairs of coincident nodes, then for the pairs of neighbors.
-/// There is no call without pairs. More than `most_pairs` pairs are divided among several calls of at most `most_pairs`
-/// pairs each. Pairs of neighbors are ordered by the voxel that contains their leader.
+/// There is no call without pairs. More than `max_pairs` pairs are divided among several calls of at most `max_pairs`
+/// pairs each. Pairs of neighbors are ordered so that their leaders are close in space.
 ///
 /// # Groups as nodes
 ///
@@ -165,11 +165,11 @@ pub struct PassCounts {
 ///
 /// # Errors
 /// Returns the first error of `measure`; nothing else fails.
-pub fn run<E>(
+pub fn merge_survivors<E>(
     survivors: &Survivors<'_>,
     recipe: &recipe::MergeParams,
     limit: Option<usize>,
-    most_pairs: usize,
+    max_pairs: usize,
     mut measure: impl FnMut(RequestedPairs<'_>) -> Result<Vec<f64>, E>,
 ) -> Result<MergeResult, E> {
     let importance = &survivors.importance;
@@ -181,16 +181,21 @@ pub fn run<E>(
         if remaining_joins == Some(0) {
             break;
         }
+        let tests = PassTests {
+            appearance: AppearanceThresholds::new(recipe, pass),
+            max_distance: pass.epsilon * unit,
+            max_neighbors: recipe.max_neighbors,
+            min_similarity: pass.tau_m,
+            max_pairs,
+        };
         let mut counts = PassCounts::default();
         for coincident in [true, false] {
-            let rank = ranks(&groups, importance);
             let nodes = MergeNodes::new(survivors, &groups, &proxies);
-            let kind = (coincident, most_pairs);
-            let pairs = find_pairs(&nodes, &rank, recipe, (pass, unit), kind, &mut counts, &mut measure)?;
+            let pairs = find_pairs(&nodes, &tests, coincident, &mut counts, &mut measure)?;
             if coincident && pairs.is_empty() {
                 continue;
             }
-            let clustering = greedy::cluster(&rank, pairs, remaining_joins);
+            let clustering = greedy::cluster(&nodes.rank, pairs, remaining_joins);
             remaining_joins = remaining_joins.map(|joins| joins - clustering.joins);
             counts.joins += clustering.joins;
             counts.rounds += clustering.rounds;
@@ -206,32 +211,44 @@ pub fn run<E>(
     Ok(MergeResult { groups, proxies, passes })
 }
 
-/// Finds the pairs (leader, member) of `nodes` that pass all tests of a merging pass: pairs of coincident nodes if
-/// `coincident`, otherwise pairs of neighbors. Adds the numbers of pairs to `counts`. For the other arguments see
-/// [`run`] and [`each_candidate`].
+/// Tests of one merging pass, and its limits.
+struct PassTests {
+    /// Thresholds of tests 1 (place and size) and 2 (color).
+    appearance: AppearanceThresholds,
+    /// Maximum distance ε of two neighbors at the reference frame, in scene units.
+    max_distance: f64,
+    /// Maximum number of neighbors of a node that are examined.
+    max_neighbors: usize,
+    /// Motion similarity τ_m that a pair must exceed to pass test 3.
+    min_similarity: f64,
+    /// Maximum number of pairs whose motion is measured in one call, at least 1.
+    max_pairs: usize,
+}
+
+/// Finds the pairs (leader, member) of `nodes` that pass all `tests` of a merging pass: pairs of coincident nodes if
+/// `coincident`, otherwise pairs of neighbors. Adds the numbers of pairs to `counts`. `measure`: see
+/// [`merge_survivors`].
 fn find_pairs<E>(
     nodes: &MergeNodes<'_>,
-    rank: &[u32],
-    recipe: &recipe::MergeParams,
-    (pass, unit): (&recipe::MergePass, f64),
-    (coincident, most_pairs): (bool, usize),
+    tests: &PassTests,
+    coincident: bool,
     counts: &mut PassCounts,
     measure: &mut impl FnMut(RequestedPairs<'_>) -> Result<Vec<f64>, E>,
 ) -> Result<Vec<(u32, u32)>, E> {
-    let (row, max_distance) = (nodes.groups.leaders(), pass.epsilon * unit);
+    let (row, max_distance) = (nodes.groups.leaders(), tests.max_distance);
     let mut passing = Vec::new();
     let take = |pairs: &[(u32, u32)], is_part| {
-        let likeness = measure(RequestedPairs { pairs, row, max_distance, is_part })?;
-        debug_assert_eq!(likeness.len(), pairs.len(), "one likeness per pair");
-        let alike = pairs.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
-        passing.extend(alike.map(|(&pair, _)| pair));
+        let similarities = measure(RequestedPairs { pairs, row, max_distance, is_part })?;
+        debug_assert_eq!(similarities.len(), pairs.len(), "one similarity per pair");
+        let similar = pairs.iter().zip(similarities).filter(|&(_, similarity)| similarity > tests.min_similarity);
+        passing.extend(similar.map(|(&pair, _)| pair));
         counts.candidates += pairs.len();
         Ok(())
     };
     if coincident {
-        each_coincident(nodes, rank, &AppearanceThresholds::new(recipe, pass), most_pairs, take)?;
+        each_coincident(nodes, tests, take)?;
     } else {
-        counts.truncated = each_candidate(nodes, rank, recipe, (pass, unit), most_pairs, take)?;
+        counts.truncated = each_candidate(nodes, tests, take)?;
     }
     counts.passing += passing.len();
     Ok(passing)
@@ -257,6 +274,8 @@ struct MergeNodes<'a> {
     /// For each node, the row with its state: a row of `survivors.states` for a single Gaussian, a row of `proxies` for
     /// a merged group.
     place: Vec<u32>,
+    /// Rank of each node by contribution, from 0 (see [`ranks`]). The node of a group with the lowest rank is its leader.
+    rank: Vec<u32>,
 }
 
 impl<'a> MergeNodes<'a> {
@@ -265,7 +284,7 @@ impl<'a> MergeNodes<'a> {
         for (proxy, group) in groups.clusters().enumerate() {
             place[group as usize] = proxy as u32;
         }
-        MergeNodes { survivors, groups, proxies, place }
+        MergeNodes { survivors, groups, proxies, place, rank: ranks(groups, &survivors.importance) }
     }
 
     fn len(&self) -> usize {
@@ -310,11 +329,11 @@ impl<'a> MergeNodes<'a> {
 }
 
 /// Finds sets of coincident nodes (Gaussians or merged groups): nodes that are equal in every attribute that tests 1
-/// and 2 ([`appearance`]) compare, and that pass these tests with the thresholds `gates`. The leader of a set is the
-/// node with the lowest `rank`; all others are its members, however many there are.
+/// and 2 ([`appearance`]) compare, and that pass these tests. The leader of a set is the node with the lowest rank; all
+/// others are its members, however many there are.
 ///
-/// Calls `take` with the pairs (leader, member), ordered by leader. Each call gets at most `max_batch` pairs (at least
-/// 1), and whether the pairs are divided among several calls.
+/// Calls `take` with the pairs (leader, member), ordered by leader. Each call gets at most [`PassTests::max_pairs`]
+/// pairs, and whether the pairs are divided among several calls.
 ///
 /// This step is needed because the neighbor search returns only a fixed number of nearest Gaussians. If more Gaussians
 /// than that coincide, each of them finds only neighbors that coincide with it. Without this step, the coincident
@@ -324,14 +343,12 @@ impl<'a> MergeNodes<'a> {
 /// Returns the first error of `take`.
 fn each_coincident<E>(
     nodes: &MergeNodes<'_>,
-    rank: &[u32],
-    gates: &AppearanceThresholds,
-    max_batch: usize,
+    tests: &PassTests,
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<(), E> {
     let key = |node: usize| nodes.appearance_bits(node).iter().fold(0, |key, &bits| hash_id(key ^ u64::from(bits)));
     let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
-    let mut order: Vec<(u64, u32, u32)> = usable.map(|node| (key(node), rank[node], node as u32)).collect();
+    let mut order: Vec<(u64, u32, u32)> = usable.map(|node| (key(node), nodes.rank[node], node as u32)).collect();
     order.par_sort_unstable();
     let mut pairs = Vec::new();
     for coincident in order.chunk_by(|a, b| a.0 == b.0).filter(|coincident| coincident.len() > 1) {
@@ -340,22 +357,21 @@ fn each_coincident<E>(
         let class = nodes.class(leader as usize);
         let is_equal = |node: usize| nodes.class(node) == class && nodes.appearance_bits(node) == bits;
         let is_member =
-            |node: u32| is_equal(node as usize) && gates.pass(&appearance, &nodes.appearance(node as usize));
+            |node: u32| is_equal(node as usize) && tests.appearance.pass(&appearance, &nodes.appearance(node as usize));
         pairs.extend(coincident[1..].iter().filter(|member| is_member(member.2)).map(|member| (leader, member.2)));
     }
     drop(order);
     pairs.par_sort_unstable();
-    let is_part = pairs.len() > max_batch;
-    pairs.chunks(max_batch).try_for_each(|some| take(some, is_part))
+    let is_part = pairs.len() > tests.max_pairs;
+    pairs.chunks(tests.max_pairs).try_for_each(|some| take(some, is_part))
 }
 
-/// Finds the pairs of nodes (Gaussians or merged groups) that pass tests 1 (place and size) and 2 (color) of `pass`. A
-/// pair (leader, member) proposes to merge the member into the leader. The member is among the leader's nearest
-/// neighbors and has a higher `rank`. `unit`: number of scene units in one unit of the recipe's lengths. Returns the
-/// number of nodes with more neighbors within the radius ε than were examined.
+/// Finds the pairs of nodes (Gaussians or merged groups) that pass tests 1 (place and size) and 2 (color). A pair
+/// (leader, member) proposes to merge the member into the leader. The member is among the leader's nearest neighbors and
+/// has a higher rank. Returns the number of nodes with more neighbors within the radius ε than were examined.
 ///
-/// Calls `take` with the pairs, ordered by leader in voxel order, then by distance. Each call gets at most `max_batch`
-/// pairs (at least 1), and whether the pairs are divided among several calls.
+/// Calls `take` with the pairs, ordered by leader so that successive leaders are close in space, then by distance. Each
+/// call gets at most [`PassTests::max_pairs`] pairs, and whether the pairs are divided among several calls.
 ///
 /// A node that may not merge, or has a value that is not finite, is in no pair and does not count as a neighbor.
 ///
@@ -363,25 +379,21 @@ fn each_coincident<E>(
 /// Returns the first error of `take`.
 fn each_candidate<E>(
     nodes: &MergeNodes<'_>,
-    rank: &[u32],
-    recipe: &recipe::MergeParams,
-    (pass, unit): (&recipe::MergePass, f64),
-    max_batch: usize,
+    tests: &PassTests,
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<usize, E> {
     let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
     let points = usable.map(|node| TreePoint { position: nodes.position(node), index: node as u32 }).collect();
-    let index = PointIndex::new(points, pass.epsilon * unit);
-    let gates = AppearanceThresholds::new(recipe, pass);
+    let index = PointIndex::new(points, tests.max_distance);
     let find_pairs = |search: &mut NeighborSearch<'_>, leaders: &[TreePoint]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
         for &TreePoint { position, index: i } in leaders {
             let (appearance, class) = (nodes.appearance(i as usize), nodes.class(i as usize));
-            let passes =
-                |j: u32| nodes.class(j as usize) == class && gates.pass(&appearance, &nodes.appearance(j as usize));
-            let (near, cut) = search.nearest(i, position, recipe.max_neighbors);
+            let looks_alike = |j: u32| tests.appearance.pass(&appearance, &nodes.appearance(j as usize));
+            let passes = |j: u32| nodes.class(j as usize) == class && looks_alike(j);
+            let (near, cut) = search.nearest(i, position, tests.max_neighbors);
             truncated += usize::from(cut);
-            let behind = near.filter(|&j| rank[i as usize] < rank[j as usize]);
+            let behind = near.filter(|&j| nodes.rank[i as usize] < nodes.rank[j as usize]);
             pairs.extend(behind.filter(|&j| passes(j)).map(|j| (i, j)));
         }
         (pairs, truncated)
@@ -396,10 +408,10 @@ fn each_candidate<E>(
             pairs.extend(chunk_pairs);
             truncated += cut;
         }
-        while pairs.len() > max_batch {
+        while pairs.len() > tests.max_pairs {
             is_part = true;
-            take(&pairs[..max_batch], is_part)?;
-            pairs.drain(..max_batch);
+            take(&pairs[..tests.max_pairs], is_part)?;
+            pairs.drain(..tests.max_pairs);
         }
     }
     if !pairs.is_empty() {

@@ -1,7 +1,7 @@
 //! Measurement of the motion similarity of pairs of Gaussians over all frames.
 //!
-//! If all pairs fit into memory, they are measured in one read of the source. Otherwise [`crate::merging::run`] divides
-//! them into partitions of a fixed number of consecutive pairs in voxel order, so that the Gaussians of a partition are
+//! If all pairs fit into memory, they are measured in one read of the source. Otherwise [`merge_survivors`](crate::merging::merge_survivors) divides them
+//! into partitions of a fixed number of consecutive pairs whose leaders are close in space, so that the Gaussians of a partition are
 //! close in space. The trajectories of all survivors (Gaussians left by pruning) are then first gathered in a scratch
 //! file in voxel order. For each partition, the Gaussians of its pairs are read from this file; a Gaussian with pairs
 //! in several partitions is read for each of them. Partitions are cut by counting pairs, so even a voxel with more
@@ -38,26 +38,18 @@ pub fn bytes_per_gaussian(frames_held: usize) -> usize {
 /// Measurement of the motion similarity of pairs of Gaussians of a source: settings, and the trajectories gathered so
 /// far.
 pub struct PairMeter<'a> {
-    /// Source from which the trajectories are read.
-    pub source: &'a dyn FrameSource,
-    /// Scan parameters. The measurement uses `alpha_min`, the opacity from which a Gaussian is alive, and `motion`,
-    /// which defines the steps between frames that count as motion.
-    pub scan: &'a recipe::ScanParams,
-    /// Thresholds of test 3 (motion) of merging.
-    pub gate: MotionThresholds,
-    /// Number of consecutive frames that a reader keeps in memory; trajectories are gathered this many frames at a
-    /// time.
-    pub max_kept_frames: usize,
-    /// Folder in which the scratch file for trajectories is created.
-    pub scratch: PathBuf,
-    /// Receiver of progress events.
-    pub events: Events,
+    source: &'a dyn FrameSource,
+    scan: &'a recipe::ScanParams,
+    thresholds: MotionThresholds,
+    max_kept_frames: usize,
+    scratch: PathBuf,
+    events: Events,
     /// Trajectories gathered in a scratch file; `None` until they are first needed.
-    pub gathered: Option<GatheredTrajectories>,
+    gathered: Option<GatheredTrajectories>,
 }
 
 /// Trajectories of Gaussians in a scratch file, in voxel order: Gaussians close in space are close in the file.
-pub struct GatheredTrajectories {
+struct GatheredTrajectories {
     trajectories: Trajectories,
     /// For every index of a trajectory in the file, the row of its Gaussian in the list of ids.
     order: Vec<u32>,
@@ -65,10 +57,35 @@ pub struct GatheredTrajectories {
     place: Vec<u32>,
 }
 
-impl PairMeter<'_> {
+impl<'a> PairMeter<'a> {
+    /// Creates a measurement without gathered trajectories.
+    /// - `source`: source from which the trajectories are read.
+    /// - `scan`: scan parameters. The measurement uses `alpha_min`, the opacity from which a Gaussian is alive, and
+    ///   `motion`, which defines the steps between frames that count as motion.
+    /// - `thresholds`: thresholds of test 3 (motion) of merging.
+    /// - `max_kept_frames`: number of consecutive frames that a reader keeps in memory; trajectories are gathered this
+    ///   many frames at a time.
+    /// - `scratch`: folder in which the scratch file for trajectories is created.
+    /// - `events`: receiver of progress events.
+    pub fn new(
+        source: &'a dyn FrameSource,
+        scan: &'a recipe::ScanParams,
+        thresholds: MotionThresholds,
+        max_kept_frames: usize,
+        scratch: PathBuf,
+        events: Events,
+    ) -> Self {
+        PairMeter { source, scan, thresholds, max_kept_frames, scratch, events, gathered: None }
+    }
+
     /// Returns a copy of this pair meter with the same settings but without gathered trajectories.
     pub fn without_trajectories(&self) -> Self {
         PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
+    }
+
+    /// Returns the parameters of the scan that define life spans and motion.
+    pub fn scan(&self) -> &'a recipe::ScanParams {
+        self.scan
     }
 
     /// Measures the motion similarity of each of `pairs` and returns it with its pair, in any order.
@@ -106,8 +123,8 @@ impl PairMeter<'_> {
             let places = rows.iter().map(|&row| reference.row(row as usize));
             let mut motion = PairMotionAccumulator::new(local_indices(&pairs, &rows), places, self.scan.motion);
             self.play_source(&rows.iter().map(|&row| ids[row as usize]).collect::<Vec<u32>>(), &mut motion)?;
-            let measured = motion.finish().map(|pair| self.gate.similarity(&pair));
-            return Ok(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)).collect());
+            let measured = motion.finish().map(|pair| self.thresholds.similarity(&pair));
+            return Ok(pairs.iter().zip(measured).map(|(&(a, b), similarity)| (a, b, similarity)).collect());
         };
         for (a, b) in &mut pairs {
             let (i, j) = (place[*a as usize], place[*b as usize]);
@@ -123,10 +140,10 @@ impl PairMeter<'_> {
                 ([x, y, z], opacity(logit) >= self.scan.alpha_min)
             });
         })?;
-        let measured = motion.finish().map(|pair| self.gate.similarity(&pair));
-        let by_row = |(&(i, j), likeness): (&(u32, u32), f64)| {
+        let measured = motion.finish().map(|pair| self.thresholds.similarity(&pair));
+        let by_row = |(&(i, j), similarity): (&(u32, u32), f64)| {
             let (a, b) = (order[i as usize], order[j as usize]);
-            (a.min(b), a.max(b), likeness)
+            (a.min(b), a.max(b), similarity)
         };
         Ok(pairs.iter().zip(measured).map(by_row).collect())
     }
@@ -216,15 +233,9 @@ mod tests {
 
         fn measure(&self, source: &dyn FrameSource, pairs_together: usize, reach: f64) -> Result<Vec<(u32, u32, u64)>> {
             let folder = tempfile::tempdir().unwrap();
-            let mut meter = PairMeter {
-                source,
-                scan: &self.recipe.scan,
-                gate: MotionThresholds::new(&self.recipe.merge, 4.0),
-                max_kept_frames: 4,
-                scratch: folder.path().to_owned(),
-                events: Events::IGNORED,
-                gathered: None,
-            };
+            let thresholds = MotionThresholds::new(&self.recipe.merge, 4.0);
+            let scratch = folder.path().to_owned();
+            let mut meter = PairMeter::new(source, &self.recipe.scan, thresholds, 4, scratch, Events::IGNORED);
             let is_part = self.pairs.len() > pairs_together;
             // Without pairs there is still one (empty) part.
             let starts = (0..self.pairs.len().max(1)).step_by(pairs_together);
@@ -245,7 +256,7 @@ mod tests {
         /// without dividing the pairs into partitions. Returns for each pair the indices of its Gaussians in `ids` and
         /// the bits of the similarity (`f64::to_bits`), so that NaN equals NaN.
         fn measure_whole(&self) -> Vec<(u32, u32, u64)> {
-            let gate = MotionThresholds::new(&self.recipe.merge, 4.0);
+            let thresholds = MotionThresholds::new(&self.recipe.merge, 4.0);
             let reference = (0..self.ids.len()).map(|i| self.reference.row(i));
             let mut motion = PairMotionAccumulator::new(self.pairs.iter().copied(), reference, self.recipe.scan.motion);
             for frame in 0..self.scene.info().times.len() {
@@ -253,8 +264,8 @@ mod tests {
                 let alive = |i| opacity(state.opacity_logit.plane(0)[i]) >= self.recipe.scan.alpha_min;
                 motion.add_frame(|i| (state.position.row(i), alive(i)));
             }
-            let likeness = motion.finish().map(|pair| gate.similarity(&pair).to_bits());
-            self.pairs.iter().zip(likeness).map(|(&(a, b), likeness)| (a, b, likeness)).collect()
+            let similarity = motion.finish().map(|pair| thresholds.similarity(&pair).to_bits());
+            self.pairs.iter().zip(similarity).map(|(&(a, b), similarity)| (a, b, similarity)).collect()
         }
     }
 
@@ -264,7 +275,7 @@ mod tests {
         let case = Case::new(reach);
         let (all, expected) = (case.pairs.len(), case.measure_whole());
         assert!(all > 1000, "{all} pairs");
-        let apart = expected.iter().filter(|(.., likeness)| f64::from_bits(*likeness).is_nan()).count();
+        let apart = expected.iter().filter(|(.., similarity)| f64::from_bits(*similarity).is_nan()).count();
         assert!(apart > 0 && apart + 100 < all, "{apart} of {all} drift apart");
         for partitions in [1, 7, 64, all] {
             let got = case.measure(&case.scene, all.div_ceil(partitions), reach).unwrap();

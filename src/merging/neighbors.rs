@@ -1,63 +1,19 @@
-//! Search for the nearest neighbors of every Gaussian, by a hash table of voxels whose side is the maximum distance ε.
+//! Search for the nearest neighbors of every Gaussian, by a k-d tree.
 //!
-//! Input: positions. Output: for each Gaussian its nearest neighbors, at most K within ε, nearest first, ties by index.
-//! The result is defined by distance and index alone, so it does not depend on voxels, hashes, threads or any partition
-//! of space.
-//!
-//! Points are sorted by voxel, and the hash table holds the start of each voxel. All points within ε of a point lie in
-//! its own voxel or in one of the 26 around it. These voxels are looked up once for all points of a voxel, and skipped
-//! if they are farther away than the worst neighbor found so far. A voxel with very many points has a [`Tree`], so that
-//! many points in one voxel, or an ε that spans the scene, cost no more than a tree search.
-//!
-//! Memory: 16 bytes per point, and 13 bytes per entry of the hash table. For V voxels that contain points, the table
-//! has at most 16/7 · V entries, and V is at most the number of points. Total: at most 16 + 13 · 16/7 ≈ 46 bytes per
-//! point, and 40 while points are sorted.
-//!
-//! Source: spatial hashing after M. Teschner et al., "Optimized spatial hashing for collision detection of deformable
-//! objects", 2003.
-
-use std::ops::Range;
-
-use hashbrown::HashTable;
-use rayon::prelude::*;
+//! Input: positions. Output: for each Gaussian its nearest neighbors, at most K within the distance ε, nearest first,
+//! ties by index. The result is defined by distance and index alone, so it does not depend on the tree or on threads.
+//! Memory: 16 bytes per point, and that of the [`Tree`].
 
 use super::tree::{NearestPoints, Tree, TreePoint};
-use super::voxels::{VoxelGrid, morton_bits, voxel_of};
-use crate::model::hash_id;
-
-/// Maximum number of points in a voxel without a tree. Trees in voxels of 8 to 64 points would cost up to a third more
-/// time for evenly distributed points, and save 7% for clusters.
-const MAX_WITHOUT_TREE: usize = 64;
-/// Bound on the rounding error of a position in the grid, as a fraction of a voxel's side. Coordinates are up to 2²¹
-/// sides and are rounded to 53 bits a few times.
-const ROUNDING: f64 = 1.0 / (1 << 20) as f64;
 
 /// Index of points that finds the neighbors of each point within the distance ε. Holds only points with finite
 /// coordinates.
 #[derive(Debug)]
 pub struct PointIndex {
     epsilon: f64,
-    voxels: VoxelGrid,
-    /// Indexed points, sorted by the voxel that contains them.
+    /// Indexed points, in the order of the leaves of `tree`.
     points: Vec<TreePoint>,
-    /// Trees of the voxels with more than [`MAX_WITHOUT_TREE`] points, in the order of the voxels.
-    trees: Vec<Tree>,
-    table: HashTable<FilledVoxel>,
-}
-
-/// A voxel that contains at least one point.
-#[derive(Debug, Clone, Copy)]
-struct FilledVoxel {
-    start: u32,
-    len: u32,
-    /// Index of the voxel's tree in `trees`; an index beyond the last one if the voxel has no tree.
-    tree: u32,
-}
-
-impl FilledVoxel {
-    fn points(self) -> Range<usize> {
-        self.start as usize..self.start as usize + self.len as usize
-    }
+    tree: Tree,
 }
 
 impl PointIndex {
@@ -67,36 +23,12 @@ impl PointIndex {
     /// Edge cases: ε = 0 finds exact duplicates; an infinite ε reaches all points.
     pub fn new(mut points: Vec<TreePoint>, epsilon: f64) -> Self {
         points.retain(|point| point.position.iter().all(|x| x.is_finite()));
-        // Sides are slightly longer than ε. Otherwise rounding could put two points at the exact distance ε into voxels
-        // that do not touch.
-        let voxels = VoxelGrid::around(points.iter().map(|point| point.position), epsilon * (1.0 + 2.0 * ROUNDING));
-        let rows: Vec<u32> = (0..points.len() as u32).collect();
-        let order = voxels.sort_rows(&rows, |row| points[row as usize].position);
-        drop(rows);
-        points = order.into_iter().map(|row| points[row as usize]).collect();
-        let number = |point: &TreePoint| voxels.morton_code(point.position);
-        let in_same_voxel = |a: &TreePoint, b: &TreePoint| number(a) == number(b);
-        let trees: Vec<Tree> = points
-            .par_chunk_by_mut(in_same_voxel)
-            .filter(|voxel_points| voxel_points.len() > MAX_WITHOUT_TREE)
-            .map(Tree::new)
-            .collect();
-        let mut table = HashTable::with_capacity(points.chunk_by(in_same_voxel).count());
-        let (mut start, mut tree) = (0, 0);
-        for voxel_points in points.chunk_by(in_same_voxel) {
-            let is_sparse = voxel_points.len() <= MAX_WITHOUT_TREE;
-            let voxel =
-                FilledVoxel { start, len: voxel_points.len() as u32, tree: if is_sparse { u32::MAX } else { tree } };
-            table.insert_unique(hash(number(&voxel_points[0])), voxel, |voxel| {
-                hash(number(&points[voxel.start as usize]))
-            });
-            start += voxel.len;
-            tree += u32::from(!is_sparse);
-        }
-        PointIndex { epsilon, voxels, points, trees, table }
+        let tree = Tree::new(&mut points);
+        PointIndex { epsilon, points, tree }
     }
 
-    /// Returns all indexed points, sorted by voxel. Neighbor queries are fastest in this order.
+    /// Returns all indexed points. Points that are close in space are mostly close in this list, so neighbor queries are
+    /// fastest in its order.
     pub fn points(&self) -> &[TreePoint] {
         &self.points
     }
@@ -104,33 +36,14 @@ impl PointIndex {
     /// Creates a search for the points nearest to a position. It can be used for many positions; each thread needs its
     /// own.
     pub fn search(&self) -> NeighborSearch<'_> {
-        NeighborSearch { index: self, last_voxel: None, around: Vec::new(), nearest: NearestPoints::default() }
-    }
-
-    fn find_voxel(&self, number: u64) -> Option<FilledVoxel> {
-        let has_number =
-            |voxel: &FilledVoxel| self.voxels.morton_code(self.points[voxel.start as usize].position) == number;
-        self.table.find(hash(number), has_number).copied()
+        NeighborSearch { index: self, nearest: NearestPoints::default() }
     }
 }
 
-/// Returns the hash of the voxel with Morton code `number`. The eight voxels of a 2×2×2 cube follow one another in the
-/// table, so that the 27 voxels around a position lie in 8 places of memory instead of 27. The table compares the
-/// highest bits of two hashes before it compares the entries; the hashes within a cube differ in these bits, too.
-fn hash(number: u64) -> u64 {
-    let corner = number & 7;
-    (hash_id(number >> 3) & !7 | corner) ^ corner << 60
-}
-
-/// Search for the points of a [`PointIndex`] that are nearest to a position. Remembers the voxels around the voxel
-/// queried last, so that a further query in the same voxel does not look them up again.
+/// Search for the points of a [`PointIndex`] that are nearest to a position.
 #[derive(Debug)]
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
-    last_voxel: Option<[u32; 3]>,
-    /// Of the 27 voxels at and around the voxel queried last, those that contain points. Each comes with the step along
-    /// the three axes from the queried voxel to it, encoded as in [`STEPS`].
-    around: Vec<([u8; 3], FilledVoxel)>,
     nearest: NearestPoints,
 }
 
@@ -147,78 +60,22 @@ impl NeighborSearch<'_> {
         position: [f32; 3],
         k: usize,
     ) -> (impl ExactSizeIterator<Item = u32>, bool) {
-        let index = self.index;
         // One neighbor more than `k` is sought, to know whether there are more.
-        self.nearest.start_query(query_index, position, k + 1, index.epsilon);
+        self.nearest.start_query(query_index, position, k + 1, self.index.epsilon);
         if position.iter().all(|x| x.is_finite()) {
-            let grid_position = index.voxels.grid_coordinates(position);
-            let voxel = voxel_of(grid_position);
-            if self.last_voxel != Some(voxel) {
-                self.look_up(voxel);
-            }
-            // Returns the smallest squared distance to a neighboring voxel along one axis. These distances add up over
-            // the axes.
-            let gap = |part: f64| ((part - ROUNDING).max(0.0) * index.voxels.side()).powi(2);
-            let gaps: [[f64; 3]; 3] = std::array::from_fn(|c| {
-                let inside = grid_position[c] - f64::from(voxel[c]);
-                [0.0, gap(inside), gap(1.0 - inside)]
-            });
-            for &(step, occupied) in &self.around {
-                if self.nearest.could_improve_at((0..3).map(|c| gaps[c][usize::from(step[c])]).sum()) {
-                    let points = &index.points[occupied.points()];
-                    match index.trees.get(occupied.tree as usize) {
-                        Some(tree) => tree.search(points, &mut self.nearest),
-                        None => self.nearest.add_points(points),
-                    }
-                }
-            }
+            self.index.tree.search(&self.index.points, &mut self.nearest);
         }
         let neighbors = self.nearest.sort_by_distance();
         (neighbors[..neighbors.len().min(k)].iter().map(|&(_, index)| index), neighbors.len() > k)
     }
-
-    /// Looks up `voxel` and the 26 voxels around it, and remembers those that contain points.
-    fn look_up(&mut self, voxel: [u32; 3]) {
-        self.last_voxel = Some(voxel);
-        // One below 0 wraps to a number beyond the last voxel, for which there is no voxel.
-        let numbers: [[Option<u64>; 3]; 3] = std::array::from_fn(|c| {
-            [voxel[c], voxel[c].wrapping_sub(1), voxel[c] + 1].map(|number| morton_bits(c, number))
-        });
-        let index = self.index;
-        self.around.clear();
-        self.around.extend(STEPS.iter().filter_map(|&step| {
-            let [x, y, z] = std::array::from_fn(|c| numbers[c][usize::from(step[c])]);
-            Some((step, index.find_voxel(x? | y? | z?)?))
-        }));
-    }
 }
-
-/// Steps from a voxel to itself and to the 26 voxels around it. A step has one number per axis: 0 stays, 1 goes down, 2
-/// goes up. The voxel itself comes first, then those that share a side, an edge and a corner. Near voxels come first so
-/// that more of the far ones can be skipped.
-const STEPS: [[u8; 3]; 27] = {
-    let mut steps = [[0; 3]; 27];
-    let (mut filled, mut moved) = (0, 0);
-    while moved <= 3 {
-        let mut k = 0;
-        while k < 27 {
-            let step = [k % 3, k / 3 % 3, k / 9];
-            if (step[0] > 0) as u8 + (step[1] > 0) as u8 + (step[2] > 0) as u8 == moved {
-                steps[filled] = step;
-                filled += 1;
-            }
-            k += 1;
-        }
-        moved += 1;
-    }
-    steps
-};
 
 #[cfg(test)]
 mod tests {
     use std::time::Instant;
 
     use proptest::prelude::*;
+    use rayon::prelude::*;
 
     use super::*;
 
@@ -280,7 +137,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
 
-        // Clusters far narrower and far wider than ε give voxels with and without trees, side by side.
+        // Clusters are far narrower and far wider than ε.
         #[test]
         fn distant_clusters_equal_brute_force(
             centers in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 1..5),
@@ -296,7 +153,7 @@ mod tests {
             prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
-        // A point at each end of the range of f32 makes voxels wider than all other distances.
+        // There is a point at each end of the range of f32.
         #[test]
         fn extreme_coordinates_equal_brute_force(
             points in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 0..150),
@@ -308,7 +165,7 @@ mod tests {
         }
     }
 
-    // Neighbors are exactly ε away, on the borders of voxels, for several grid origins and values of ε.
+    // Neighbors are exactly ε away.
     #[test]
     fn points_exactly_epsilon_away_are_found() {
         for unit in [1.0f32, 0.1, 3e-7, 7e9] {
@@ -377,7 +234,7 @@ mod tests {
 
     #[test]
     #[ignore = "ten million points: minutes and gigabytes; run with --release"]
-    fn ten_million_points_in_one_voxel_cost_bounded_time() {
+    fn ten_million_points_within_epsilon_cost_bounded_time() {
         let n = 10_000_000;
         let position = |i: u64, salt: u64| {
             let hash = xxhash_rust::xxh3::xxh3_64_with_seed(&i.to_le_bytes(), salt);

@@ -99,7 +99,7 @@ impl MergeScene {
             frames.iter().for_each(|frame| motion.add_frame(|i| (frame.row(i), true)));
             Ok::<_, Infallible>(motion.finish().map(|pair| gate.similarity(&pair)).collect())
         };
-        match run(&survivors, recipe, limit, max_pairs, measure) {
+        match merge_survivors(&survivors, recipe, limit, max_pairs, measure) {
             Ok(merged) => (merged, batches),
             Err(never) => match never {},
         }

@@ -50,7 +50,7 @@ impl NearestPoints {
     }
 
     /// Adds every point in `points` that can still be one of the requested nearest points.
-    pub fn add_points(&mut self, points: &[TreePoint]) {
+    fn add_points(&mut self, points: &[TreePoint]) {
         for point in points {
             let candidate =
                 (squared(std::array::from_fn(|c| f64::from(point.position[c]) - self.position[c])), point.index);
@@ -61,12 +61,6 @@ impl NearestPoints {
                 }
             }
         }
-    }
-
-    /// Returns whether a point with a squared distance of `bound` or more could still be one of the requested nearest
-    /// points.
-    pub fn could_improve_at(&self, bound: f64) -> bool {
-        bound.to_bits() <= self.worst.0
     }
 
     /// Returns the points found as (bits of the squared distance, index), nearest first, equal distances by index.

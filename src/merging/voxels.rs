@@ -1,30 +1,34 @@
-//! A grid of voxels: cubes of equal size, sorted in Morton order, which keeps neighbors together (G. M. Morton, "A
-//! computer oriented geodetic data base", 1966).
+//! Order of Gaussians by voxels: cubes of equal size, sorted in Morton order, which keeps neighbors together (G. M.
+//! Morton, "A computer oriented geodetic data base", 1966).
 //!
-//! Gaussians that are close in space are mostly close in this order, too. The list of all Gaussians in this order can
-//! therefore be processed in consecutive parts. Take a part together with its ghosts, which are all Gaussians within
-//! one voxel side of it: it contains every pair of Gaussians that are at most one side apart and of which one is in the
-//! part. The order affects only the speed of reading, never a result. Memory while sorting: 20 bytes per Gaussian
-//! beside the output.
+//! Gaussians that are close in space are mostly close in this order, too. The order affects only the speed of reading,
+//! never a result. Memory while sorting: 20 bytes per Gaussian beside the output.
 
 use rayon::prelude::*;
 
 /// Maximum number of voxels along an axis. Three voxel numbers of 21 bits form a 63-bit Morton code.
 const MAX_PER_AXIS: u32 = 1 << 21;
 
+/// Returns the row indices `rows` sorted by the Morton code of the voxel of each row, ties by row index. `at` returns the
+/// position of a row, in scene units. Voxels have the side `side`, or are wider if there would be more than 2²¹ of them
+/// along an axis. The positions may be infinite or NaN.
+pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
+    let grid = VoxelGrid::around(rows.iter().map(|&row| at(row)), side);
+    let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (grid.morton_code(at(row)), row)).collect();
+    keyed.par_sort_unstable();
+    keyed.into_iter().map(|(_, row)| row).collect()
+}
+
 /// Grid of voxels that covers a set of points.
-#[derive(Debug, Clone, Copy)]
-pub struct VoxelGrid {
+struct VoxelGrid {
     low: [f64; 3],
-    side: f64,
+    /// Number of voxels per scene unit along an axis.
     per_unit: f64,
 }
 
 impl VoxelGrid {
-    /// Creates a grid that starts at the lowest coordinates of `points`, with voxels of side `side`. The voxels are
-    /// wider if there would be more than 2²¹ along an axis. Edge cases: if all points are at one position and the side
-    /// is zero, there is one voxel. Coordinates that are not finite are ignored.
-    pub fn around(points: impl Iterator<Item = [f32; 3]>, side: f64) -> Self {
+    /// Creates a grid that starts at the lowest finite coordinates of `points`, with voxels of side `side` or wider.
+    fn around(points: impl Iterator<Item = [f32; 3]>, side: f64) -> Self {
         let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for point in points {
             for c in (0..3).filter(|&c| point[c].is_finite()) {
@@ -33,52 +37,15 @@ impl VoxelGrid {
             }
         }
         let widest = (0..3).map(|c| high[c] - low[c]).fold(0.0, f64::max);
-        let side = side.max(widest / f64::from(MAX_PER_AXIS));
-        VoxelGrid { low, side, per_unit: side.recip() }
-    }
-
-    /// Returns the side length of a voxel, in scene units.
-    pub fn side(&self) -> f64 {
-        self.side
-    }
-
-    /// Returns the position of `at` relative to the lowest corner of the grid, in voxel sides.
-    pub fn grid_coordinates(&self, at: [f32; 3]) -> [f64; 3] {
-        std::array::from_fn(|c| (f64::from(at[c]) - self.low[c]) * self.per_unit)
+        VoxelGrid { low, per_unit: side.max(widest / f64::from(MAX_PER_AXIS)).recip() }
     }
 
     /// Returns the Morton code of the voxel that contains the position `at`.
-    pub fn morton_code(&self, at: [f32; 3]) -> u64 {
-        let voxel = voxel_of(self.grid_coordinates(at));
-        (0..3).filter_map(|c| morton_bits(c, voxel[c])).sum()
+    fn morton_code(&self, at: [f32; 3]) -> u64 {
+        // A saturating cast maps numbers beyond the range of u32 to its ends, and NaN (from 0·∞) to 0.
+        let number = |c: usize| ((f64::from(at[c]) - self.low[c]) * self.per_unit) as u32;
+        (0..3).map(|c| spread_bits(number(c).min(MAX_PER_AXIS - 1).into()) << c).sum()
     }
-
-    /// Returns the row indices `rows` sorted by the Morton code of the voxel of each row, ties by row index. `at`
-    /// returns the position of a row, in scene units.
-    pub fn sort_rows(&self, rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync) -> Vec<u32> {
-        let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (self.morton_code(at(row)), row)).collect();
-        keyed.par_sort_unstable();
-        keyed.into_iter().map(|(_, row)| row).collect()
-    }
-}
-
-/// Returns `rows` sorted as by [`VoxelGrid::sort_rows`], in a grid of voxels of side `side` that covers their
-/// positions. `at` returns the position of a row.
-pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
-    VoxelGrid::around(rows.iter().map(|&row| at(row)), side).sort_rows(rows, at)
-}
-
-/// Returns the voxel at `place` (a result of [`VoxelGrid::grid_coordinates`]) as its number along each axis, counted
-/// from 0. For a position outside of the grid, returns the nearest voxel; a coordinate that is NaN gives the number 0.
-pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
-    // A saturating cast maps values beyond the range of u32 to its ends, and NaN (from 0·∞) to 0.
-    place.map(|x| (x as u32).min(MAX_PER_AXIS - 1))
-}
-
-/// Returns the part of a voxel's Morton code that belongs to `axis`, for a voxel with the number `number` along this
-/// axis; `None` if the grid has no such voxel.
-pub fn morton_bits(axis: usize, number: u32) -> Option<u64> {
-    (number < MAX_PER_AXIS).then(|| spread_bits(number.into()) << axis)
 }
 
 /// Spreads the lowest 21 bits of `x`: bit k moves to bit 3k.

@@ -8,7 +8,7 @@ use super::generated::clouds::{Random, random_gaussians};
 use crate::error::{Error, Result};
 use crate::merging::moments::{Ellipsoid, WeightedGaussian, moments, reorder_axes_to_match};
 use crate::merging::proxy::{Importance, merge_member_states, weights};
-use crate::merging::{Survivors, run};
+use crate::merging::{Survivors, merge_survivors};
 use crate::model::{Attributes, Gaussians};
 use crate::recipe::{MergeParams, ProxyOpacity, ProxyPosition, Recipe};
 
@@ -96,8 +96,9 @@ pub(super) fn duplicates(worst: &mut LargestError) -> Result<()> {
         (ProxyOpacity::Area, 8.0 * opacity),
         (ProxyOpacity::Union, 1.0 - (1.0 - opacity).powi(8)),
     ] {
-        let merged =
-            run(&survivors, &recipe(rule)?, None, 1000, |asked| Ok::<_, Error>(vec![1.0; asked.pairs().len()]))?;
+        let merged = merge_survivors(&survivors, &recipe(rule)?, None, 1000, |asked| {
+            Ok::<_, Error>(vec![1.0; asked.pairs().len()])
+        })?;
         let groups = &merged.groups;
         let members: Vec<&[u32]> = (0..groups.group_count()).map(|group| groups.members(group)).collect();
         let mut sorted = members;

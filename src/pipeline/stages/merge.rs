@@ -319,15 +319,14 @@ impl<'a> Trial<'a> {
         let mut merge = stage.recipe.clone();
         let unit = merge.length_unit.in_scene_units(scored.reference.extent);
         merge.motion_noise = merge.motion_noise.max(2.0 * scored.position_ulp / unit);
-        let meter = PairMeter {
+        let meter = PairMeter::new(
             source,
-            scan: &stage.scan,
-            gate: MotionThresholds::new(&merge, unit),
-            max_kept_frames: scene.limits.max_kept_frames,
-            scratch: scene.scratch.clone(),
-            events: scene.events.clone(),
-            gathered: None,
-        };
+            &stage.scan,
+            MotionThresholds::new(&merge, unit),
+            scene.limits.max_kept_frames,
+            scene.scratch.clone(),
+            scene.events.clone(),
+        );
         let (pairs_together, similarities) = (scene.limits.pairs_together, SimilarityCache::default());
         let importance = scored.importance()?;
         let work = &scene.work;
@@ -385,7 +384,7 @@ impl<'a> Trial<'a> {
             extent: scored.reference.extent,
         };
         let max_pairs = *pairs_together;
-        let merged = merging::run(&survivors, merge, limit, max_pairs, |requested| {
+        let merged = merging::merge_survivors(&survivors, merge, limit, max_pairs, |requested| {
             let missing = similarities.missing(requested.pairs());
             let measured = match missing.is_empty() {
                 true => Vec::new(),
@@ -423,7 +422,7 @@ fn measure(
     let rows: Vec<u32> = (0..pool.len() as u32).collect();
     let place = inverse_permutation(&voxel_order(&rows, |row| reference.row(row as usize), requested.max_distance));
     pairs.par_sort_unstable_by_key(|&(a, b)| (place[a as usize], place[b as usize]));
-    let key = work.key(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
+    let key = work.key(&(merge, meter.scan().alpha_min, meter.scan().motion, pool, &pairs));
     let (fresh, meter) = (meter.without_trajectories(), RefCell::new(meter));
     let compute = |range: Range<usize>| match range.len() == pairs.len() {
         true => meter.borrow_mut().measure(pool, reference, pairs.clone(), requested.max_distance, requested.is_part),
