@@ -171,8 +171,8 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Keeps the first frame only, for a tile whose frames are all equal: drops the multiples and exceptions (values
-    /// stored with their original bits) of all later frames.
+    /// Keeps the first frame only, for a tile whose frames are all equal: drops the multiples and exceptions of all
+    /// later frames.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
@@ -234,9 +234,9 @@ fn static_step(step: f64, halvings: u32) -> f64 {
     if halvings == 0 { step } else { 0.5 * step }
 }
 
-/// Decoder of a lossy tile: turns the stored bytes of the tile into the quantized value of each track (component of a
-/// Gaussian), and quantized values into f32 values. First call [`BoundedTracks::read_head`], which stores the fields
-/// before the zstd frame, then [`BoundedTracks::read_mask`], which stores the number of moving tracks.
+/// Decoder of a lossy tile: turns the stored bytes of the tile into the quantized value of each track, and quantized
+/// values into f32 values. First call [`BoundedTracks::read_head`], which stores the fields before the zstd frame, then
+/// [`BoundedTracks::read_mask`], which stores the number of moving tracks.
 #[derive(Debug, Default)]
 pub(crate) struct BoundedTracks {
     /// Quantization steps: first of static tracks (components of a Gaussian whose values in all frames are stored as
@@ -293,9 +293,9 @@ impl BoundedTracks {
         self.mask_bytes() + 4 * self.frames * self.plane
     }
 
-    /// Reads the mask at the start of `bytes`, the decompressed bytes of the tile. The mask has one bit per track
-    /// (component of a Gaussian), which is set if the track changes in the tile (is moving). Stores the number of
-    /// moving tracks, and checks the length of `bytes`. An error says what was found instead of a valid tile.
+    /// Reads the mask at the start of `bytes`, the decompressed bytes of the tile. The mask has one bit per track,
+    /// which is set if the track changes in the tile (is moving). Stores the number of moving tracks, and checks the
+    /// length of `bytes`. An error says what was found instead of a valid tile.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;
@@ -308,8 +308,8 @@ impl BoundedTracks {
         Ok(())
     }
 
-    /// Returns for each track (component of a Gaussian) its value in the first frame, as a zigzag-coded multiple of the
-    /// quantization step. `bytes` are the decompressed bytes of the tile.
+    /// Returns for each track its value in the first frame, as a zigzag-coded multiple of the quantization step.
+    /// `bytes` are the decompressed bytes of the tile.
     pub(crate) fn first_frame<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = u32> + 'a {
         let (from, plane) = (self.mask_bytes(), self.plane);
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))
@@ -324,9 +324,8 @@ impl BoundedTracks {
         moving.map(move |(nth, track)| (track, shuffled_value(&bytes[from..], values, nth * after_first + frame - 1)))
     }
 
-    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per track (component of a Gaussian). `multiples`
-    /// holds the quantized value of each track in this frame, in quantization steps; `bytes` are the decompressed bytes
-    /// of the tile.
+    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per track. `multiples` holds the quantized value
+    /// of each track in this frame, in quantization steps; `bytes` are the decompressed bytes of the tile.
     pub(crate) fn values(&self, bytes: &[u8], frame: usize, multiples: &[u32], out: &mut [u32]) {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);
@@ -339,19 +338,19 @@ impl BoundedTracks {
         }
     }
 
-    /// Returns the bytes of heap memory that the list of exceptions (values stored with their original bits) takes.
+    /// Returns the bytes of heap memory that the list of exceptions takes.
     pub(crate) fn memory(&self) -> usize {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }
 
-    /// Returns the length in bytes of the mask, which has one bit per track (component of a Gaussian).
+    /// Returns the length in bytes of the mask, which has one bit per track.
     fn mask_bytes(&self) -> usize {
         self.plane.div_ceil(8)
     }
 }
 
-/// Returns whether track `track` (component of a Gaussian) changes in the tile, according to the mask at the start of
-/// `bytes`, which has one bit per track.
+/// Returns whether track `track` changes in the tile, according to the mask at the start of `bytes`, which has one bit
+/// per track.
 fn moves(bytes: &[u8], track: usize) -> bool {
     bytes[track / 8] >> (track % 8) & 1 != 0
 }

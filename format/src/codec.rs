@@ -51,7 +51,7 @@ pub enum Compression {
     },
 }
 
-/// Encoding of the values of a tile (one column for a block of Gaussians and frames) in its stored bytes.
+/// Encoding of the values of a tile in its stored bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
     /// Raw: little-endian f32.
@@ -80,8 +80,7 @@ impl fmt::Display for Encoding {
     }
 }
 
-/// Statistics of the stored values of a tile (one column for a block of Gaussians and frames). A constant tile, whose
-/// frames are all equal, stores one frame.
+/// Statistics of the stored values of a tile. A constant tile, whose frames are all equal, stores one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileStats {
     /// Smallest finite value, with −0 counted as +0; +∞ if no value is finite.
@@ -99,7 +98,7 @@ impl fmt::Display for TileStats {
     }
 }
 
-/// Encoded tile (one column for a block of Gaussians and frames), to be passed to [`crate::Writer::write_tile`].
+/// Encoded tile, to be passed to [`crate::Writer::write_tile`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct EncodedTile {
     pub(crate) frames: u32,
@@ -194,8 +193,7 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
     Ok(EncodedTile { frames, width, len, constant, encoding, max_error: 0.0, stats: stats(bits), checksum, bytes })
 }
 
-/// Decoder of one tile (one column for a block of Gaussians and frames) that is stored in the lossless or the lossy
-/// encoding. Decodes the tile frame by frame.
+/// Decoder of one tile that is stored in the lossless or the lossy encoding. Decodes the tile frame by frame.
 ///
 /// Memory of a lossless tile: 4 bytes per value of the tile, and two decoded frames. A lossy tile takes in addition 1/8
 /// byte per value of one frame for the mask of moving tracks, and up to 1/2 byte per value of the tile for exceptions
@@ -214,7 +212,7 @@ pub(crate) struct TileDecoder {
     tracks: BoundedTracks,
 }
 
-/// Stored bytes of a tile (one column for a block of Gaussians and frames), and the parameters needed to decode them.
+/// Stored bytes of a tile, and the parameters needed to decode them.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct StoredTile<'a> {
     pub(crate) bytes: &'a [u8],

@@ -82,8 +82,8 @@ impl Index {
     /// - whether the pass has shown that no two tiles overlap in the file. It shows this only if the tiles lie in the
     ///   file in the order of the index.
     ///
-    /// The pass remembers only the last constant tile (all frames equal) of each column and Gaussian block. `chunk` is
-    /// a buffer for reading.
+    /// The pass remembers only the last constant tile of each column and Gaussian block. `chunk` is a buffer for
+    /// reading.
     fn check_entries(
         &self,
         file: &MappedFile,
@@ -120,8 +120,7 @@ impl Index {
         Ok((varies, in_order))
     }
 
-    /// Checks that no two tiles use the same bytes of the file, except constant tiles (all frames equal) that share all
-    /// of them.
+    /// Checks that no two tiles use the same bytes of the file, except constant tiles that share all of them.
     fn check_overlap(&self, tiles: &[TileRecord]) -> std::result::Result<(), Fault> {
         let mut order: Vec<usize> = (0..tiles.len()).collect();
         order.sort_unstable_by_key(|&i| (tiles[i].offset, i));

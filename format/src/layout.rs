@@ -140,7 +140,7 @@ impl Layout {
         Some(u64::from(id.frame_block) * self.tiles_per_frame_block() + within)
     }
 
-    /// Returns the tile at position `index` of the index (table of tiles). Inverse of [`Layout::index_of`].
+    /// Returns the tile at position `index` of the index. Inverse of [`Layout::index_of`].
     pub(crate) fn tile_at(&self, index: u64) -> TileId {
         let columns = self.columns.len() as u64;
         TileId {

@@ -56,7 +56,7 @@ pub struct TileBuffer {
     zstd: Option<Decompressor<'static>>,
 }
 
-/// Counts of the data of tiles (each one column for a block of Gaussians and frames) that a reader has read so far.
+/// Counts of the data of tiles that a reader has read so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TileReadCounts {
     /// Number of bytes of stored tile data that were read from the file.
@@ -75,7 +75,7 @@ pub struct Tile<'a> {
     constant: bool,
 }
 
-/// Entry in the index (table of tiles) of a container for one tile: one column for a block of Gaussians and frames.
+/// Entry in the index of a container for one tile: one column for a block of Gaussians and frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileInfo {
     /// Encoding (raw, lossless or lossy) of the values of the tile in its stored bytes.
@@ -135,9 +135,9 @@ impl<'a> Tile<'a> {
 }
 
 impl Reader {
-    /// Opens a container and checks its header, footer and index (table of tiles): every length and offset is within
-    /// its limits, and no two tiles overlap. The tiles themselves are checked when they are read, or by
-    /// [`Reader::verify`]. Fails if a check fails or the file cannot be read.
+    /// Opens a container and checks its header, footer and index: every length and offset is within its limits, and no
+    /// two tiles overlap. The tiles themselves are checked when they are read, or by [`Reader::verify`]. Fails if a
+    /// check fails or the file cannot be read.
     pub fn open(path: impl AsRef<Path>) -> Result<Reader> {
         Self::open_within(path, u64::MAX)
     }
@@ -302,9 +302,8 @@ impl Reader {
         self.read_record(&tile, buffer)
     }
 
-    /// Returns the values of the tile `at` (one column for a block of Gaussians and frames). They are read by system
-    /// calls into `buffer`, never through the memory map, and checked against the checksum. A file that is cut short at
-    /// any moment thus causes an error and nothing worse.
+    /// Returns the values of the tile `at`. They are read by system calls into `buffer`, never through the memory map,
+    /// and checked against the checksum. A file that is cut short at any moment thus causes an error and nothing worse.
     pub fn read_tile<'a>(&self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         self.read_record(&self.record(at)?.1, buffer)
     }
@@ -353,7 +352,7 @@ impl Reader {
         Ok(true)
     }
 
-    /// Returns a tile's position in the index (table of tiles) and its entry there. Fails if there is no such tile.
+    /// Returns a tile's position in the index and its entry there. Fails if there is no such tile.
     fn record(&self, at: TileId) -> Result<(usize, TileRecord)> {
         let index = self.layout.index_of(at).filter(|&index| index < self.index.tiles).ok_or_else(|| {
             let frames = self.frames();

@@ -47,7 +47,7 @@ pub(crate) struct TimesRecord {
     pub(crate) checksum: u64,
 }
 
-/// Header of the footer, the record whose payload contains all time stamps and the index (table of tiles).
+/// Header of the footer, the record whose payload contains all time stamps and the index.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct FooterRecord {
     pub(crate) frames: u64,
@@ -228,7 +228,7 @@ impl TileRecord {
 
     /// Returns whether the tiles of this record and of `other` may use the same stored bytes. Three conditions must
     /// hold:
-    /// - Both tiles are constant (all frames equal).
+    /// - Both tiles are constant.
     /// - They belong to the same column and Gaussian block.
     /// - All other fields of the records are equal, except for the frame block and the number of frames.
     pub(crate) fn may_share(&self, other: &TileRecord) -> bool {

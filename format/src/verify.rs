@@ -32,7 +32,7 @@ impl Reader {
     ///   statistics;
     /// - all bytes in between: they are zero.
     ///
-    /// Memory: one [`TileBuffer`], 1 byte per tile, about 20 bytes per constant tile (all frames equal).
+    /// Memory: one [`TileBuffer`], 1 byte per tile, about 20 bytes per constant tile.
     pub fn verify(&self) -> Result<VerifyReport> {
         self.verify_within(u64::MAX)
     }

@@ -42,15 +42,14 @@ pub struct Writer {
     /// of 64.
     position: u64,
     times: Vec<f64>,
-    /// Unnamed temporary file that contains the index (table of tiles): the 64-byte record of tile i at byte 64·i, or
-    /// zeros if the tile is not written yet.
+    /// Unnamed temporary file that contains the index: the 64-byte record of tile i at byte 64·i, or zeros if the tile
+    /// is not written yet.
     index: File,
     /// Number of all tiles, written or not, of the frame blocks whose time stamps have been appended so far.
     tiles: u64,
     /// Number of tiles written so far.
     written: u64,
-    /// Last constant tile (all frames equal) written for each column and Gaussian block; empty before the first frame
-    /// block.
+    /// Last constant tile written for each column and Gaussian block; empty before the first frame block.
     constants: Vec<Option<TileRecord>>,
     stored: Vec<u8>,
     finished: bool,
@@ -176,10 +175,10 @@ impl Writer {
         Ok(())
     }
 
-    /// Writes the tile `at` as a copy of the last constant tile (all frames equal) of its column and Gaussian block.
-    /// The file gets the same bytes as if the values had been encoded again and given to [`Writer::write_tile`]. Fails
-    /// if the layout has no tile `at`, if its time stamps have not been appended, if it was written before, or if no
-    /// constant tile of its column and Gaussian block was written before.
+    /// Writes the tile `at` as a copy of the last constant tile of its column and Gaussian block. The file gets the
+    /// same bytes as if the values had been encoded again and given to [`Writer::write_tile`]. Fails if the layout has
+    /// no tile `at`, if its time stamps have not been appended, if it was written before, or if no constant tile of its
+    /// column and Gaussian block was written before.
     pub fn repeat_tile(&mut self, at: TileId) -> Result<()> {
         let (index, frames) = self.unwritten_entry(at)?;
         let slot = index as usize % self.constants.len();
@@ -194,8 +193,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Returns the position of the tile `at` in the index (table of tiles), and its number of frames. Fails if the tile
-    /// does not exist yet or was written before.
+    /// Returns the position of the tile `at` in the index, and its number of frames. Fails if the tile does not exist
+    /// yet or was written before.
     fn unwritten_entry(&mut self, at: TileId) -> Result<(u64, u32)> {
         let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
             return Err(Error::usage(format!("{at} does not exist after {} frames", self.times.len())));
@@ -207,7 +206,7 @@ impl Writer {
         Ok((index, (frames.end - frames.start) as u32))
     }
 
-    /// Returns whether the tile at position `index` of the index (table of tiles) has been written.
+    /// Returns whether the tile at position `index` of the index has been written.
     fn has_entry(&mut self, index: u64) -> Result<bool> {
         let mut bytes = Vec::new();
         let read = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
@@ -216,9 +215,9 @@ impl Writer {
         Ok(bytes.iter().any(|&byte| byte != 0))
     }
 
-    /// Stores `record` at position `index` of the index (table of tiles), and counts its tile as written. The caller
-    /// has already appended the tile to the file, from offset `start` on. If this function fails, it sets the writing
-    /// position back to `start`, so that the next tile overwrites the appended one.
+    /// Stores `record` at position `index` of the index, and counts its tile as written. The caller has already
+    /// appended the tile to the file, from offset `start` on. If this function fails, it sets the writing position back
+    /// to `start`, so that the next tile overwrites the appended one.
     fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
         let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
@@ -230,8 +229,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Reads the index (table of tiles) from its temporary file. Calls `each` with this writer and the bytes of
-    /// successive chunks of the index.
+    /// Reads the index from its temporary file. Calls `each` with this writer and the bytes of successive chunks of the
+    /// index.
     fn for_each_index_chunk(&mut self, mut each: impl FnMut(&mut Writer, &[u8]) -> Result<()>) -> Result<()> {
         let end = RECORD_BYTES * self.tiles;
         let mut chunk = Vec::new();
@@ -300,9 +299,9 @@ impl Writer {
         Ok(digest.value())
     }
 
-    /// Returns the offset in the file of stored bytes that equal `bytes`, if `record` is a constant tile (all frames
-    /// equal) and the last constant tile of `slot` (its column and Gaussian block) has such bytes. Equal checksums are
-    /// only a hint; the bytes are read back and compared.
+    /// Returns the offset in the file of stored bytes that equal `bytes`, if `record` is a constant tile and the last
+    /// constant tile of `slot` (its column and Gaussian block) has such bytes. Equal checksums are only a hint; the
+    /// bytes are read back and compared.
     fn shared_payload(&mut self, slot: usize, record: &TileRecord, bytes: &[u8]) -> Result<Option<u64>> {
         let Some(earlier) = self.constants[slot] else { return Ok(None) };
         if !record.may_share(&TileRecord { offset: record.offset, ..earlier }) {

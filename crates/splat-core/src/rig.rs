@@ -99,9 +99,9 @@ impl Rig {
         times
     }
 
-    /// Returns this rig for a scene that does not move: no view has a time, so every camera sees every frame. Of several
-    /// views of one camera in one split, the first is kept. If different cameras then have views of the same number,
-    /// the views of each camera get the index of the camera as their number.
+    /// Returns this rig for a scene that does not move: no view has a time, so every camera sees every frame. Of
+    /// several views of one camera in one split, the first is kept. If different cameras then have views of the same
+    /// number, the views of each camera get the index of the camera as their number.
     pub fn without_times(mut self) -> Rig {
         let mut kept = HashSet::new();
         self.views.retain(|rig_view| kept.insert((rig_view.camera, rig_view.split)));

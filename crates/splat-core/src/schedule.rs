@@ -22,10 +22,10 @@ pub struct ViewSchedule {
 /// Run: consecutive frames that have equal views. A run ends at the first frame of the next run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct ViewRun {
-    /// Index in the sequence of the first frame of the run (consecutive frames with equal views).
+    /// Index in the sequence of the first frame of the run.
     frame: usize,
-    /// Index of the first view of the run (consecutive frames with equal views) in the field `views` of
-    /// [`ViewSchedule`]. The views of the run end where those of the next run begin.
+    /// Index of the first view of the run in the field `views` of [`ViewSchedule`]. The views of the run end where
+    /// those of the next run begin.
     view: usize,
 }
 
@@ -75,9 +75,8 @@ impl ViewSchedule {
         self.frames += count;
     }
 
-    /// Returns the bytes of memory that a schedule takes, for `runs` runs (consecutive frames with equal views) with at
-    /// most `views` views each. The bytes of the entries are doubled, because a growing vector reserves up to twice its
-    /// length.
+    /// Returns the bytes of memory that a schedule takes, for `runs` runs with at most `views` views each. The bytes of
+    /// the entries are doubled, because a growing vector reserves up to twice its length.
     pub const fn bytes(runs: u64, views: u64) -> u64 {
         2 * runs * (size_of::<ViewRun>() as u64 + views * size_of::<(u32, u32)>() as u64)
     }
@@ -126,14 +125,13 @@ impl ViewSchedule {
         used
     }
 
-    /// Returns the views of the run with the index `run` (consecutive frames with equal views), as pairs (view number,
-    /// camera index).
+    /// Returns the views of the run with the index `run`, as pairs (view number, camera index).
     fn views_of_run(&self, run: usize) -> &[(u32, u32)] {
         let end = self.runs.get(run + 1).map_or(self.views.len(), |next| next.view);
         &self.views[self.runs[run].view..end]
     }
 
-    /// Returns the number of frames of the run with the index `run` (consecutive frames with equal views).
+    /// Returns the number of frames of the run with the index `run`.
     fn run_length(&self, run: usize) -> usize {
         self.runs.get(run + 1).map_or(self.frames, |next| next.frame) - self.runs[run].frame
     }

@@ -30,8 +30,7 @@ pub struct FieldConfig {
     /// Whether the field computes a mask (a factor on the stored attributes of each Gaussian) with an additional head
     /// (output MLP). If true, `empty_voxel` is ignored.
     pub static_mlp: bool,
-    /// Whether the field reads a mask (a factor on the stored attributes of each Gaussian) from a grid of voxels in
-    /// space, at the stored position of the Gaussian.
+    /// Whether the field reads a mask from a grid of voxels in space, at the stored position of the Gaussian.
     pub empty_voxel: bool,
     /// Frequency p of the encoding of the plane features f. If p is above 1, the trunk (first MLP) reads f, sin(p·f)
     /// and cos(p·f); otherwise it reads only f.
@@ -49,21 +48,20 @@ pub struct FieldConfig {
 pub(super) enum Mask {
     /// The field has no mask: deltas are added to the stored attributes themselves.
     None,
-    /// The last head (output MLP) of the field computes the mask (factor on stored attributes), which varies with time
-    /// (option `static_mlp`).
+    /// The last head (output MLP) of the field computes the mask, which varies with time (option `static_mlp`).
     Head,
-    /// A voxel grid contains the mask (factor on stored attributes), which is constant in time (option `empty_voxel`).
+    /// A voxel grid contains the mask, which is constant in time (option `empty_voxel`).
     Voxel(VoxelMask),
 }
 
-/// Head: small MLP that computes the deltas of one attribute, or the mask (factor on stored attributes).
+/// Head: small MLP that computes the deltas of one attribute, or the mask.
 ///
 /// Its input is the output of the trunk (the MLP shared by all attributes) after ReLU. It consists of a hidden layer,
 /// ReLU and an output layer.
 #[derive(Debug, Clone)]
 pub(super) struct Head {
-    /// Attribute whose deltas the head (output MLP) computes; `None` if it computes the mask (factor on stored
-    /// attributes) of the option `static_mlp`.
+    /// Attribute whose deltas the head (output MLP) computes; `None` if it computes the mask of the option
+    /// `static_mlp`.
     pub(super) column: Option<Attributes>,
     pub(super) hidden: Linear,
     pub(super) output: Linear,
@@ -350,9 +348,9 @@ pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features
     }
 }
 
-/// Evaluates the layers of the trunk (the MLP shared by all attributes) for `input`. Returns the output of the last
-/// layer after ReLU, which every head (MLP of one attribute) reads. `last` and `spare` are buffers for the outputs of
-/// the layers; the returned slice is the content of `last`.
+/// Evaluates the layers of the trunk for `input`. Returns the output of the last layer after ReLU, which every head
+/// (MLP of one attribute) reads. `last` and `spare` are buffers for the outputs of the layers; the returned slice is
+/// the content of `last`.
 #[inline(always)]
 fn run_trunk<'a, S: InstructionSet>(
     layers: &[Linear],

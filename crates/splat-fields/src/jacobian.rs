@@ -26,7 +26,7 @@ struct JacobianGroup {
     features: Vec<CacheLine>,
     /// Derivatives of the plane features with respect to x, y and z.
     slopes: [Vec<CacheLine>; 3],
-    /// Output of every layer of the trunk (the MLP shared by all attributes) after ReLU.
+    /// Output of every layer of the trunk after ReLU.
     trunk: Vec<Vec<CacheLine>>,
     hidden: Vec<CacheLine>,
     /// Derivatives of one position component with respect to the input of the layer that the backward pass has reached.
@@ -106,8 +106,8 @@ impl Field {
     }
 }
 
-/// [`Evaluation`] that computes the result of [`Field::position_jacobian`] into `out`. `planes`: the feature planes with
-/// what was prepared for the positions; `None` if the field has no planes.
+/// [`Evaluation`] that computes the result of [`Field::position_jacobian`] into `out`. `planes`: the feature planes
+/// with what was prepared for the positions; `None` if the field has no planes.
 struct PositionJacobian<'a> {
     field: &'a Field,
     head: &'a Head,
@@ -162,8 +162,8 @@ impl Evaluation for PositionJacobian<'_> {
 }
 
 impl JacobianGroup {
-    /// Evaluates the trunk (MLP shared by all attributes) and the hidden layer of `head` for the plane features of the
-    /// group, and keeps the outputs of all layers for the backward pass.
+    /// Evaluates the trunk and the hidden layer of `head` for the plane features of the group, and keeps the outputs of
+    /// all layers for the backward pass.
     #[inline(always)]
     fn forward<S: InstructionSet>(&mut self, field: &Field, head: &Head) {
         self.trunk.resize(field.trunk.len(), Vec::new());
@@ -189,8 +189,7 @@ impl JacobianGroup {
     }
 
     /// Converts `gradient` from derivatives with respect to the outputs of `head` to derivatives with respect to the
-    /// features, by a backward pass through the head (MLP of the position) and the trunk (MLP shared by all
-    /// attributes).
+    /// features, by a backward pass through the head (MLP of the position) and the trunk.
     #[inline(always)]
     fn backward<S: InstructionSet>(&mut self, field: &Field, head: &Head) {
         let JacobianGroup { trunk, hidden, gradient, spare, .. } = self;

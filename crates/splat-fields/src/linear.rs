@@ -3,8 +3,8 @@
 //! On loading, weights are reordered into panels of four outputs each. The sums of a panel (four outputs of [`LANES`]
 //! Gaussians) take eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds; with AVX-512,
 //! the sums of four panels take sixteen of 32 registers. The lanes of a register belong to different Gaussians, not to
-//! different outputs, so layers with few outputs are not slower per output. A matrix library that reorders its operands in every call would spend a seventh of its time on this
-//! reordering, because these matrices are small.
+//! different outputs, so layers with few outputs are not slower per output. A matrix library that reorders its operands
+//! in every call would spend a seventh of its time on this reordering, because these matrices are small.
 
 use splat_core::error::Result;
 
@@ -104,8 +104,8 @@ impl Linear {
         });
     }
 
-    /// Computes the outputs before ReLU for `input` `[inputs, LANES]`, and calls `take` with the index and the values of
-    /// each. The outputs that fill up the last panel are included.
+    /// Computes the outputs before ReLU for `input` `[inputs, LANES]`, and calls `take` with the index and the values
+    /// of each. The outputs that fill up the last panel are included.
     #[inline(always)]
     fn for_each_output<S: InstructionSet>(&self, input: &[CacheLine], mut take: impl FnMut(usize, &CacheLine)) {
         let input = &input[..self.inputs];

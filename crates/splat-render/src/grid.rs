@@ -53,9 +53,10 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Returns which tiles of a render of this grid a splat can change: the range (first, end) of their columns if `axis`
-    /// is 0, of their rows if it is 1. Each of these tiles has 16×16 pixels of the grid. The range is empty if the splat
-    /// changes no pixel of the grid. Tile numbers are integers in f64, so that the compiler vectorizes the calling loop.
+    /// Returns which tiles of a render of this grid a splat can change: the range (first, end) of their columns if
+    /// `axis` is 0, of their rows if it is 1. Each of these tiles has 16×16 pixels of the grid. The range is empty if
+    /// the splat changes no pixel of the grid. Tile numbers are integers in f64, so that the compiler vectorizes the
+    /// calling loop.
     ///
     /// The splat can change only pixels that lie in the tiles of `image_range` and are at most `half` from `at`.
     ///
@@ -71,8 +72,8 @@ impl PixelGrid {
         }
         let first = (start * TILE_PIXELS).max((at - half).ceil());
         let last = (end * TILE_PIXELS).min(size).min((at + half).floor().max(0.0) + 1.0);
-        // Number of columns or rows of the grid before a pixel. The quotient of two 32-bit integers in f64 is rounded to
-        // an integer only if it is one.
+        // Number of columns or rows of the grid before a pixel. The quotient of two 32-bit integers in f64 is rounded
+        // to an integer only if it is one.
         let count_before =
             |pixel: f64| ((pixel - f64::from(self.phase[axis])).max(0.0) / f64::from(self.stride)).ceil();
         let (first, last) = (count_before(first), count_before(last));

@@ -463,8 +463,8 @@ fn image_tile_range(at: f64, radius: f64, half: f64, tiles: f64) -> (f64, f64) {
     (start.max(0.0).min(tiles), end.max(0.0).min(tiles))
 }
 
-/// Returns whether a splat reaches a pixel of the image outside the tiles `start` to below `end` along one axis, so that
-/// the original CUDA rasterizer cuts it off there. The other arguments are those of [`image_tile_range`].
+/// Returns whether a splat reaches a pixel of the image outside the tiles `start` to below `end` along one axis, so
+/// that the original CUDA rasterizer cuts it off there. The other arguments are those of [`image_tile_range`].
 #[inline(always)]
 fn is_cut_off(at: f64, half: f64, (start, end): (f64, f64), tiles: f64) -> bool {
     let [start_pixel, end_pixel] = [start * f64::from(TILE), end * f64::from(TILE)];

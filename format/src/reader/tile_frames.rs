@@ -11,8 +11,8 @@ use crate::error::Result;
 use crate::layout::TileId;
 use crate::record::TileRecord;
 
-/// Frames of one tile (one column for a block of Gaussians and frames), which are decoded one at a time. Reading them
-/// in increasing order is fastest. [`Reader::load`] loads a tile.
+/// Frames of one tile, which are decoded one at a time. Reading them in increasing order is fastest. [`Reader::load`]
+/// loads a tile.
 ///
 /// Memory: a compressed tile takes 4 bytes per value of all its frames and 8 bytes per value of one frame. A raw tile
 /// (plain f32) takes no memory; if it is read in place from the memory map, the pages that were read count as memory
