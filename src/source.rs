@@ -93,7 +93,7 @@ impl ReadPlan {
     }
 
     /// Returns the first planned frame at or after `frame`; `None` if there is none.
-    pub fn next_planned(&self, frame: usize) -> Option<usize> {
+    pub fn first_planned_from(&self, frame: usize) -> Option<usize> {
         match &self.frames {
             None => Some(frame),
             Some(frames) => frames.get(frames.partition_point(|&planned| planned < frame)).copied(),
@@ -266,10 +266,10 @@ mod tests {
         assert_eq!(wanted.frames_between(9, 32), [9, 31]);
         assert_eq!(wanted.frames_between(4, 32), [4]);
         assert_eq!(
-            [wanted.next_planned(0), wanted.next_planned(32), wanted.next_planned(41)],
+            [wanted.first_planned_from(0), wanted.first_planned_from(32), wanted.first_planned_from(41)],
             [Some(3), Some(40), None]
         );
         assert_eq!(ReadPlan::all_frames().frames_between(30, 32), [30, 31]);
-        assert_eq!(ReadPlan::all_frames().next_planned(64), Some(64));
+        assert_eq!(ReadPlan::all_frames().first_planned_from(64), Some(64));
     }
 }

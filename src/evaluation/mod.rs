@@ -142,7 +142,8 @@ fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
 /// limits `limits`. `work` holds the sizes of the input; its number of Gaussians must be that of the larger model.
 pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
-    let mut need = view_selection::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
+    let mut need =
+        view_selection::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::METRIC_BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
     need.fixed.push(("scores", size_of::<ViewQuality>() as u64 * work.frame_views));
     need.fixed.push(("previous views", 3 * 12 * work.viewpoints * work.pixels));

@@ -19,30 +19,27 @@ use crate::model::inverse_permutation;
 /// after the last round are assigned sequentially. Scenes need 5 to 8 rounds. A chain of Gaussians that are ranked in
 /// their order along a line would need one round for every two Gaussians.
 const MAX_ROUNDS: usize = 32;
-/// Maximum number of undecided nodes (Gaussians or merged groups) that are assigned to their leaders sequentially at
-/// the end. For so few nodes another parallel round would take longer.
+/// Maximum number of undecided nodes that are assigned to their leaders sequentially at the end. For so few nodes
+/// another parallel round would take longer.
 const MAX_SEQUENTIAL_NODES: usize = 64;
 
-/// Result of clustering: for every node (Gaussian or merged group) its leader, which is the node that it joins or
-/// itself, and statistics of how the leaders were found.
+/// Result of clustering: for every node its leader, which is the node that it joins or itself, and statistics of how
+/// the leaders were found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Clustering {
-    /// Index of the leader of every node (Gaussian or merged group): the node that it joined, or the node itself if it
-    /// joined no other.
+    /// Index of the leader of every node: the node that it joined, or the node itself if it joined no other.
     pub leader_of: Vec<u32>,
-    /// Number of nodes (Gaussians or merged groups) that joined another node.
+    /// Number of nodes that joined another node.
     pub joins: usize,
-    /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
-    /// they join).
+    /// Number of parallel rounds in which nodes were assigned to leaders (the nodes that they join).
     pub rounds: usize,
-    /// Whether more than 64 nodes (Gaussians or merged groups) had no leader after the last of 32 parallel rounds, so
-    /// that many nodes were assigned sequentially.
+    /// Whether more than 64 nodes had no leader after the last of 32 parallel rounds, so that many nodes were assigned
+    /// sequentially.
     pub sequential: bool,
 }
 
-/// Returns the rank of every node (Gaussian or merged group), from 0: its position in the order in which the greedy
-/// rule visits the nodes. `size` holds the importance of every node. Nodes are ordered by descending `size`; ties by
-/// ascending `hash`, then by index.
+/// Returns the rank of every node, from 0: its position in the order in which the greedy rule visits the nodes. `size`
+/// holds the importance of every node. Nodes are ordered by descending `size`; ties by ascending `hash`, then by index.
 ///
 /// A size that is NaN counts as the smallest; −0 equals 0.
 pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
@@ -59,8 +56,8 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
 /// node into which the node is merged, or the node itself.
 const UNDECIDED: u32 = u32::MAX;
 
-/// Assigns every node (Gaussian or merged group) to a leader by the sequential greedy rule of this module: the node
-/// that it joins, or itself. Returns the assignment.
+/// Assigns every node to a leader by the sequential greedy rule of this module: the node that it joins, or itself.
+/// Returns the assignment.
 ///
 /// - `rank`: rank of every node, a permutation of 0..N;
 /// - `pairs`: pairs (leader, member) that passed all tests, in any order; the leader has the lower rank;
@@ -92,7 +89,7 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
     Clustering { leader_of, joins, rounds, sequential }
 }
 
-/// For every node (Gaussian or merged group), its possible leaders: the nodes of lower rank that it could join.
+/// For every node, its possible leaders: the nodes of lower rank that it could join.
 struct Predecessors {
     start: Vec<usize>,
     /// Pairs (possible leader, node). A node is a Gaussian or a merged group. It may join the possible leader, a node

@@ -66,9 +66,9 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// Opens a reader of the Gaussians with the indices `places` in this sequence, at the frames `plan`. A proxy
-    /// (Gaussian that replaces a merged cluster) is computed from its members, the Gaussians of the cluster. The
-    /// members of all proxies among `places` are read together, on all threads. Fails if a Gaussian cannot be read.
+    /// Opens a reader of the Gaussians with the indices `places` in this sequence, at the frames `plan`. A proxy is
+    /// computed from its members, the Gaussians of the cluster. The members of all proxies among `places` are read
+    /// together, on all threads. Fails if a Gaussian cannot be read.
     ///
     /// Memory for each Gaussian that is read, members of proxies included: its reader, its state at one frame, and 24
     /// bytes.
@@ -79,7 +79,7 @@ impl MergedSequence<'_> {
     }
 
     /// Returns the number of source Gaussians that the Gaussian with index `place` of this sequence replaces: the size
-    /// of its merged cluster if it is a proxy (Gaussian that replaces a merged cluster), otherwise 1.
+    /// of its merged cluster if it is a proxy, otherwise 1.
     pub fn member_count(&self, place: usize) -> usize {
         self.members[place].len().max(1)
     }
@@ -109,17 +109,17 @@ impl FrameSource for MergedSequence<'_> {
 struct MergedMembers {
     /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
-    /// For every Gaussian selected for reading, the index of its id in `ids`. A proxy (Gaussian that replaces a
-    /// cluster) has the id of its leader (most important member).
+    /// For every Gaussian selected for reading, the index of its id in `ids`. A proxy has the id of its leader (most
+    /// important member).
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
-    /// For every proxy (Gaussian that replaces a cluster) and every member of its cluster: the index of the member's id
-    /// in `ids`, then the weight of the member. The members of one proxy follow one another.
+    /// For every proxy and every member of its cluster: the index of the member's id in `ids`, then the weight of the
+    /// member. The members of one proxy follow one another.
     members: Vec<(u32, f64)>,
 }
 
 struct Proxy {
-    /// Index of this proxy (Gaussian that replaces a cluster) among the Gaussians selected for reading.
+    /// Index of this proxy among the Gaussians selected for reading.
     row: usize,
     members: Range<usize>,
 }
@@ -143,13 +143,13 @@ impl MergedMembers {
     }
 
     /// Returns the attributes that must be read from the source to compute the attributes `want` of the selected
-    /// Gaussians. These are `want` and, if a selected Gaussian is a proxy (which replaces a cluster), also [`MIXED`].
+    /// Gaussians. These are `want` and, if a selected Gaussian is a proxy, also [`MIXED`].
     fn needed(&self, want: Attributes) -> Attributes {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
     /// Computes the attributes `want` of the selected Gaussians from the source Gaussians `state`, by the parameters
-    /// `merge` for proxies (Gaussians that replace merged clusters), and writes them to `out`.
+    /// `merge` for proxies, and writes them to `out`.
     fn write(&self, state: &Gaussians, want: Attributes, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.attribute_values(column), out.attribute_values_mut(column));

@@ -45,10 +45,10 @@ use proxy::Importance;
 use similarity_cache::BYTES_PER_CACHED_PAIR;
 use tree::TreePoint;
 
-/// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. The terms are, in
-/// order: the groups before the pass, the groups after it, the row of the survivor's state, its rank, and 46 bytes for
-/// the largest of three structures that exist one after the other. These are the neighbor index (46 bytes while it is
-/// built, 30 later), the list of coincident nodes (24), and the clustering (24).
+/// Bytes of memory per survivor during a merging pass, beside its state. The terms are, in order: the groups before the
+/// pass, the groups after it, the row of the survivor's state, its rank, and 46 bytes for the largest of three
+/// structures that exist one after the other. These are the neighbor index (46 bytes while it is built, 30 later), the
+/// list of coincident nodes (24), and the clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, the callback that measures the motion of pairs; memory
@@ -64,13 +64,13 @@ pub const BYTES_PER_PASSED_PAIR: usize = size_of::<(u32, u32)>() + size_of::<u32
 /// Number of nodes (single Gaussians or merged groups) whose neighbors one parallel task looks up.
 const CHUNK: usize = 1024;
 
-/// Survivors (Gaussians left by pruning), which are to be merged: selected rows of a table of states.
+/// Survivors, which are to be merged: selected rows of a table of states.
 #[derive(Debug, Clone, Copy)]
 pub struct Survivors<'a> {
     /// Attributes of all Gaussians at the reference frame. Of the SH coefficients, comparisons use only those of degree
     /// 0; proxies (Gaussians that replace merged groups) get those of all degrees.
     pub states: &'a Gaussians,
-    /// Rows of the survivors (Gaussians left by pruning) in `states`, increasing.
+    /// Rows of the survivors in `states`, increasing.
     pub rows: &'a [u32],
     /// Ids of the Gaussians in `states`, and the contribution C and the visibility of each id. The leader of a group,
     /// into which the others are merged, is chosen by C; ties are broken by the hashes of the ids.
@@ -83,7 +83,7 @@ pub struct Survivors<'a> {
     pub extent: f64,
 }
 
-/// Pairs of nodes (single Gaussians or merged groups) of one merging pass whose motion is to be measured.
+/// Pairs of nodes of one merging pass whose motion is to be measured.
 #[derive(Debug, Clone, Copy)]
 pub struct RequestedPairs<'a> {
     pairs: &'a [(u32, u32)],
@@ -106,7 +106,7 @@ impl<'a> RequestedPairs<'a> {
 /// Result of merging: groups of Gaussians, and, for each group of more than one, the proxy (Gaussian) that replaces it.
 #[derive(Debug, Clone)]
 pub struct MergeResult {
-    /// Groups of the survivors (Gaussians left by pruning). Every survivor is in exactly one group.
+    /// Groups of the survivors. Every survivor is in exactly one group.
     pub groups: MergeGroups,
     /// Proxies at the reference frame: one merged Gaussian for each group of more than one, in the order of the groups.
     pub proxies: Gaussians,
@@ -117,25 +117,25 @@ pub struct MergeResult {
 /// Statistics of one merging pass. Its nodes are single Gaussians and the groups that earlier passes merged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PassCounts {
-    /// Number of nodes (Gaussians or merged groups) that have more neighbors within the radius ε than the allowed
-    /// maximum. Of these neighbors only the nearest were examined.
+    /// Number of nodes that have more neighbors within the radius ε than the allowed maximum. Of these neighbors only
+    /// the nearest were examined.
     pub truncated: usize,
     /// Number of candidate pairs: pairs that passed tests 1 (place and size) and 2 (color).
     pub candidates: usize,
     /// Number of candidate pairs that also passed test 3 (motion).
     pub passing: usize,
-    /// Number of nodes (Gaussians or merged groups) that joined another node.
+    /// Number of nodes that joined another node.
     pub joins: usize,
-    /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
-    /// they join). Nodes without a leader after the last round are assigned sequentially and not counted here.
+    /// Number of parallel rounds in which nodes were assigned to leaders (the nodes that they join). Nodes without a
+    /// leader after the last round are assigned sequentially and not counted here.
     pub rounds: usize,
-    /// Whether, after the last of 32 parallel rounds, more than 64 nodes (Gaussians or merged groups) had no leader yet
-    /// (node that they join), so that many nodes were assigned sequentially.
+    /// Whether, after the last of 32 parallel rounds, more than 64 nodes had no leader yet (node that they join), so
+    /// that many nodes were assigned sequentially.
     pub sequential: bool,
 }
 
-/// Merges `survivors` (Gaussians left by pruning) in all merging passes of `recipe`. Returns the groups of survivors, a
-/// proxy for each group of more than one, and statistics of the passes.
+/// Merges `survivors` in all merging passes of `recipe`. Returns the groups of survivors, a proxy for each group of
+/// more than one, and statistics of the passes.
 ///
 /// A pass merges nodes: single Gaussians, or groups that were merged before. It first merges coincident nodes, which
 /// are equal in every attribute that tests 1 and 2 compare, then neighbors. A merge joins one or more nodes, the
@@ -274,7 +274,8 @@ struct MergeNodes<'a> {
     /// For each node, the row with its state: a row of `survivors.states` for a single Gaussian, a row of `proxies` for
     /// a merged group.
     place: Vec<u32>,
-    /// Rank of each node by contribution, from 0 (see [`ranks`]). The node of a group with the lowest rank is its leader.
+    /// Rank of each node by contribution, from 0 (see [`ranks`]). The node of a group with the lowest rank is its
+    /// leader.
     rank: Vec<u32>,
 }
 
@@ -328,9 +329,9 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Finds sets of coincident nodes (Gaussians or merged groups): nodes that are equal in every attribute that tests 1
-/// and 2 ([`appearance`]) compare, and that pass these tests. The leader of a set is the node with the lowest rank; all
-/// others are its members, however many there are.
+/// Finds sets of coincident nodes: nodes that are equal in every attribute that tests 1 and 2 ([`appearance`]) compare,
+/// and that pass these tests. The leader of a set is the node with the lowest rank; all others are its members, however
+/// many there are.
 ///
 /// Calls `take` with the pairs (leader, member), ordered by leader. Each call gets at most [`PassTests::max_pairs`]
 /// pairs, and whether the pairs are divided among several calls.
@@ -366,9 +367,9 @@ fn each_coincident<E>(
     pairs.chunks(tests.max_pairs).try_for_each(|some| take(some, is_part))
 }
 
-/// Finds the pairs of nodes (Gaussians or merged groups) that pass tests 1 (place and size) and 2 (color). A pair
-/// (leader, member) proposes to merge the member into the leader. The member is among the leader's nearest neighbors and
-/// has a higher rank. Returns the number of nodes with more neighbors within the radius ε than were examined.
+/// Finds the pairs of nodes that pass tests 1 (place and size) and 2 (color). A pair (leader, member) proposes to merge
+/// the member into the leader. The member is among the leader's nearest neighbors and has a higher rank. Returns the
+/// number of nodes with more neighbors within the radius ε than were examined.
 ///
 /// Calls `take` with the pairs, ordered by leader so that successive leaders are close in space, then by distance. Each
 /// call gets at most [`PassTests::max_pairs`] pairs, and whether the pairs are divided among several calls.

@@ -13,11 +13,9 @@ use rayon::prelude::*;
 use super::appearance::COSINE_EPSILON;
 use crate::recipe::{self, MotionParams, MotionSimilarity};
 
-/// Bytes of memory that [`PairMotionAccumulator`] takes for each pair of nodes (Gaussians or merged groups) whose
-/// motion it measures.
+/// Bytes of memory that [`PairMotionAccumulator`] takes for each pair of nodes whose motion it measures.
 pub const PAIR_BYTES: usize = size_of::<NodePair>();
-/// Bytes of memory that [`PairMotionAccumulator`] takes for each node (Gaussian or merged group) whose motion it
-/// follows.
+/// Bytes of memory that [`PairMotionAccumulator`] takes for each node whose motion it follows.
 pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 
 /// Motion of two Gaussians relative to each other. A velocity is a step a = x(t) − x(t−1) between consecutive frames.
@@ -37,14 +35,14 @@ pub struct RelativeMotion {
     pub squares: f64,
     /// Number n of steps (from one frame to the next) in the sums `dot` and `squares`.
     pub steps: u32,
-    /// Number of frames in which both Gaussians are alive (opacity ≥ alpha_min).
+    /// Number of frames in which both Gaussians are alive.
     pub common: u32,
-    /// Number of frames in which at least one of the Gaussians is alive (opacity ≥ alpha_min).
+    /// Number of frames in which at least one of the Gaussians is alive.
     pub union: u32,
     /// Largest change of the offset between the two Gaussians (difference of their positions) from its value at the
-    /// reference frame. In scene units, over the frames in which both Gaussians are alive (opacity ≥ alpha_min). A
-    /// proxy (Gaussian that replaces both) is built from the offset at the reference frame. It fits other frames only
-    /// if this change is small.
+    /// reference frame. In scene units, over the frames in which both Gaussians are alive. A proxy (Gaussian that
+    /// replaces both) is built from the offset at the reference frame. It fits other frames only if this change is
+    /// small.
     pub drift: f64,
 }
 
@@ -64,8 +62,8 @@ impl RelativeMotion {
         if denominator == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / denominator }
     }
 
-    /// Returns the fraction of frames in which only one of the two Gaussians is alive (opacity ≥ alpha_min), among the
-    /// frames in which at least one is alive. Returns 1 if neither is ever alive.
+    /// Returns the fraction of frames in which only one of the two Gaussians is alive, among the frames in which at
+    /// least one is alive. Returns 1 if neither is ever alive.
     pub fn fraction_with_one_alive(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
@@ -97,7 +95,7 @@ impl MotionThresholds {
 
     /// Returns the motion similarity of a pair, in [−1, 1]. The pair passes test 3 if the similarity exceeds the
     /// minimum τ_m of the pass. Returns NaN, with which a pair never passes, in three cases:
-    /// - the two Gaussians are never alive (opacity ≥ alpha_min) together;
+    /// - the two Gaussians are never alive together;
     /// - the fraction of frames with only one alive exceeds its maximum;
     /// - the change of their offset over time ([`RelativeMotion::drift`]) exceeds its maximum.
     pub fn similarity(&self, pair: &RelativeMotion) -> f64 {
@@ -111,8 +109,8 @@ impl MotionThresholds {
     }
 }
 
-/// Position of a node (Gaussian or merged group) at the current, the previous and the reference frame, and whether it
-/// is alive (opacity ≥ alpha_min) in the current and in the previous frame.
+/// Position of a node at the current, the previous and the reference frame, and whether it is alive in the current and
+/// in the previous frame.
 #[derive(Debug, Clone, Copy, Default)]
 struct NodeTrack {
     reference: [f32; 3],
@@ -134,7 +132,7 @@ struct NodePair {
     drift_squared: f64,
 }
 
-/// Measurement of the motion of pairs of nodes (Gaussians or merged groups), to which the frames are added in order.
+/// Measurement of the motion of pairs of nodes, to which the frames are added in order.
 #[derive(Debug)]
 pub struct PairMotionAccumulator {
     motion: MotionParams,
@@ -144,13 +142,12 @@ pub struct PairMotionAccumulator {
 }
 
 impl PairMotionAccumulator {
-    /// Starts to measure the motion of each pair of nodes (Gaussians or merged groups), for its [`RelativeMotion`].
-    /// Frames are then added with [`PairMotionAccumulator::add_frame`].
+    /// Starts to measure the motion of each pair of nodes, for its [`RelativeMotion`]. Frames are then added with
+    /// [`PairMotionAccumulator::add_frame`].
     /// - `pairs` yields the indices of the two nodes of each pair.
     /// - `reference` yields the position of every node at the reference frame.
     /// - `motion` selects the steps (from one frame to the next) that count. With `Literal`, these are all steps that
-    ///   end in a frame in which both nodes are alive (opacity ≥ alpha_min). With `Runs`, a step must begin and end in
-    ///   such a frame.
+    ///   end in a frame in which both nodes are alive. With `Runs`, a step must begin and end in such a frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -167,7 +164,7 @@ impl PairMotionAccumulator {
     }
 
     /// Adds the next frame to the measurement. `state` gets the index of a node, and returns its position and whether
-    /// it is alive (opacity ≥ alpha_min).
+    /// it is alive.
     pub fn add_frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.previous, track.alive_previously) = (track.current, track.alive);

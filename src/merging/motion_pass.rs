@@ -1,12 +1,12 @@
 //! Measurement of the motion similarity of pairs of Gaussians over all frames.
 //!
-//! If all pairs fit into memory, they are measured in one read of the source. Otherwise [`merge_survivors`](crate::merging::merge_survivors) divides them
-//! into partitions of a fixed number of consecutive pairs whose leaders are close in space, so that the Gaussians of a partition are
-//! close in space. The trajectories of all survivors (Gaussians left by pruning) are then first gathered in a scratch
-//! file in voxel order. For each partition, the Gaussians of its pairs are read from this file; a Gaussian with pairs
-//! in several partitions is read for each of them. Partitions are cut by counting pairs, so even a voxel with more
-//! pairs than fit in memory is split. All sums of a pair are computed in one partition, so partitioning does not change
-//! a bit.
+//! If all pairs fit into memory, they are measured in one read of the source. Otherwise
+//! [`merge_survivors`](crate::merging::merge_survivors) divides them into partitions of a fixed number of consecutive
+//! pairs whose leaders are close in space, so that the Gaussians of a partition are close in space. The trajectories of
+//! all survivors (Gaussians left by pruning) are then first gathered in a scratch file in voxel order. For each
+//! partition, the Gaussians of its pairs are read from this file; a Gaussian with pairs in several partitions is read
+//! for each of them. Partitions are cut by counting pairs, so even a voxel with more pairs than fit in memory is split.
+//! All sums of a pair are computed in one partition, so partitioning does not change a bit.
 
 use std::path::PathBuf;
 

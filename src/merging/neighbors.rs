@@ -27,8 +27,8 @@ impl PointIndex {
         PointIndex { epsilon, points, tree }
     }
 
-    /// Returns all indexed points. Points that are close in space are mostly close in this list, so neighbor queries are
-    /// fastest in its order.
+    /// Returns all indexed points. Points that are close in space are mostly close in this list, so neighbor queries
+    /// are fastest in its order.
     pub fn points(&self) -> &[TreePoint] {
         &self.points
     }

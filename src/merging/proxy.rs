@@ -17,15 +17,13 @@ use crate::recipe::{self, ProxyHigherSh, ProxyOpacity, ProxyPosition};
 /// Number of proxies (Gaussians that replace merged clusters) that are computed before their values are written to the
 /// output.
 const BATCH: usize = 4096;
-/// Minimum distance of the opacity of a proxy (Gaussian that replaces a merged cluster) from 0 and from 1, so that its
-/// logit is finite in f32.
+/// Minimum distance of the opacity of a proxy from 0 and from 1, so that its logit is finite in f32.
 const OPACITY_MARGIN: f64 = 1.0 / (1u32 << 24) as f64;
 /// Exponent p of Thomsen's approximation of the surface of an ellipsoid (Knud Thomsen, 2004; see Michon, "Surface area
 /// of an ellipsoid").
 const THOMSEN: f64 = 1.6075;
 
-/// Attributes of a proxy (Gaussian that replaces a cluster) at the reference frame, encoded as in [`Gaussians`] but in
-/// f64.
+/// Attributes of a proxy at the reference frame, encoded as in [`Gaussians`] but in f64.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProxyState {
     /// Center of the proxy, in scene units.
@@ -157,9 +155,8 @@ pub fn merge_member_states(
     }
 }
 
-/// Computes the proxy (Gaussian that replaces several) of every group in `groups` that has more than one Gaussian, from
-/// the Gaussians `states` and their `importance`, by the parameters `merge`. The result has one row for each such
-/// group, in the order of the groups.
+/// Computes the proxy of every group in `groups` that has more than one Gaussian, from the Gaussians `states` and their
+/// `importance`, by the parameters `merge`. The result has one row for each such group, in the order of the groups.
 pub fn merge_groups(
     groups: &MergeGroups,
     importance: &Importance<'_>,

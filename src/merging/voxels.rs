@@ -9,9 +9,9 @@ use rayon::prelude::*;
 /// Maximum number of voxels along an axis. Three voxel numbers of 21 bits form a 63-bit Morton code.
 const MAX_PER_AXIS: u32 = 1 << 21;
 
-/// Returns the row indices `rows` sorted by the Morton code of the voxel of each row, ties by row index. `at` returns the
-/// position of a row, in scene units. Voxels have the side `side`, or are wider if there would be more than 2²¹ of them
-/// along an axis. The positions may be infinite or NaN.
+/// Returns the row indices `rows` sorted by the Morton code of the voxel of each row, ties by row index. `at` returns
+/// the position of a row, in scene units. Voxels have the side `side`, or are wider if there would be more than 2²¹ of
+/// them along an axis. The positions may be infinite or NaN.
 pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
     let grid = VoxelGrid::around(rows.iter().map(|&row| at(row)), side);
     let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (grid.morton_code(at(row)), row)).collect();

@@ -201,7 +201,7 @@ impl RunPlan {
         plan.output = Some(WriteStage::from_planning(&planning));
         plan.target = target;
         plan.stages.counts = CountPlan {
-            refinement_starts_at: planning.refine.as_ref().and_then(RefineStage::min_start_count_fraction),
+            prunes_in_refinement: planning.refine.as_ref().is_some_and(|refine| refine.prunes),
             searches: plan.search.is_some(),
         };
         (plan.merges, plan.refine, plan.fallback) = (planning.merges, planning.refine.clone(), fallback);

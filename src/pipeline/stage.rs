@@ -158,9 +158,9 @@ pub struct CompressedScene {
 /// optimization steps).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CountPlan {
-    /// Minimum fraction of all Gaussians with which refinement begins; its prune steps then remove Gaussians until the
-    /// target is reached. `None`: only ranking removes Gaussians.
-    pub refinement_starts_at: Option<f64>,
+    /// Whether refinement removes Gaussians in prune steps, until the target is reached. Otherwise only ranking removes
+    /// Gaussians.
+    pub prunes_in_refinement: bool,
     /// Whether the run searches for the number of Gaussians in the output.
     pub searches: bool,
 }
@@ -169,7 +169,7 @@ impl CountPlan {
     /// Returns the number of Gaussians with which refinement begins. `target_count`: number of Gaussians in the output.
     /// `input_count`: number of Gaussians in the input.
     pub fn count_before_refinement(&self, target_count: usize, input_count: usize) -> usize {
-        start_count(self.refinement_starts_at, target_count, input_count)
+        if self.prunes_in_refinement { start_count(target_count, input_count) } else { target_count }
     }
 
     /// Returns the number of Gaussians that ranking leaves. `target_count`: number of Gaussians in the output.
@@ -177,10 +177,9 @@ impl CountPlan {
     /// several models but ranks only once. In such a run the result is the number that the smallest tried model needs,
     /// whatever `target_count` is.
     pub fn count_after_ranking(&self, target_count: usize, input_count: usize) -> usize {
-        let smallest = if self.refinement_starts_at.is_some() {
-            0
-        } else {
-            (SEARCH_RANK_FRACTION * input_count as f64).ceil() as usize
+        let smallest = match self.prunes_in_refinement {
+            true => 0,
+            false => (SEARCH_RANK_FRACTION * input_count as f64).ceil() as usize,
         };
         self.count_before_refinement(if self.searches { smallest } else { target_count }, input_count)
     }
@@ -193,8 +192,8 @@ impl CountPlan {
             format!("{count} of {input_count} Gaussians ({:.0}%)", 100.0 * count as f64 / input_count.max(1) as f64)
         };
         let alone = if merges { "ranking and merging leave" } else { "ranking leaves" };
-        match (target, self.refinement_starts_at) {
-            (Some(target_count), Some(_)) => {
+        match (target, self.prunes_in_refinement) {
+            (Some(target_count), true) => {
                 let ranked = self.count_before_refinement(target_count, input_count);
                 let removed = ranked - target_count;
                 format!(
@@ -202,13 +201,13 @@ impl CountPlan {
                     share(ranked)
                 )
             }
-            (Some(target_count), None) => format!("counts: {alone} {}; refinement removes none", share(target_count)),
-            (None, Some(_)) => format!(
+            (Some(target_count), false) => format!("counts: {alone} {}; refinement removes none", share(target_count)),
+            (None, true) => format!(
                 "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found \
                  during the run",
                 share(self.count_before_refinement(0, input_count))
             ),
-            (None, None) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
+            (None, false) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
         }
     }
 }

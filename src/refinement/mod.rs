@@ -15,7 +15,7 @@
 //! [`RefineStage::resource_estimate`]), and the best parameter delta so far. The target views and the states at their
 //! frames are in scratch files.
 
-mod local;
+mod linearized;
 mod loss;
 mod mean_delta;
 pub mod optimizer;
@@ -49,9 +49,6 @@ use targets::TargetViewParams;
 
 /// Name of the refinement stage in messages and in the cache.
 const NAME: &str = "refine";
-
-/// Beginning of the reason that is recorded if refinement was omitted because it did not improve the validation PSNR.
-const NO_GAIN: &str = "it did not improve the validation PSNR";
 
 /// Time of one optimization step, divided by the time to render its view.
 const STEP_RENDERS: f64 = 3.0;
@@ -161,7 +158,7 @@ impl RefineStage {
     }
 
     /// Returns a copy of this stage with the numbers of optimization steps multiplied by `part` and rounded up, and
-    /// with parameter deltas (values that refinement adds to the stored parameters) that do not vary with time.
+    /// with parameter deltas that do not vary with time.
     pub fn with_step_fraction(&self, part: f64) -> RefineStage {
         let scaled = |steps: usize| (part * steps as f64).ceil() as usize;
         RefineStage { steps: scaled(self.steps), steps_per_prune: scaled(self.steps_per_prune), ..self.clone() }
@@ -195,15 +192,10 @@ impl RefineStage {
     }
 
     /// Returns the number of final steps (optimization steps after the last prune step) for a model that keeps `count`
-    /// of `all` Gaussians.
+    /// of `all` Gaussians: [`RefineStage::steps`] · (1 − `count`/`all`) / (1 − [`MIN_START_COUNT_FRACTION`]), at most
+    /// [`RefineStage::steps`], rounded up.
     fn final_step_count(&self, count: usize, all: usize) -> usize {
-        self.final_step_count_for(count as f64 / all.max(1) as f64)
-    }
-
-    /// Returns the number of final steps for a model that keeps the fraction `kept` of all Gaussians:
-    /// [`RefineStage::steps`] · (1 − `kept`) / (1 − [`MIN_START_COUNT_FRACTION`]), at most [`RefineStage::steps`],
-    /// rounded up.
-    fn final_step_count_for(&self, kept: f64) -> usize {
+        let kept = count as f64 / all.max(1) as f64;
         let part = ((1.0 - kept) / (1.0 - MIN_START_COUNT_FRACTION)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
     }
@@ -224,12 +216,6 @@ impl RefineStage {
     /// Gaussians there are fewer steps, because a step takes longer and more of its effect is removed later.
     fn steps_before(&self, count: usize, target_count: usize) -> usize {
         (self.steps_per_prune as f64 * (target_count as f64 / count.max(1) as f64).sqrt()).ceil() as usize
-    }
-
-    /// Returns the minimum fraction of all Gaussians with which refinement begins, before its prune steps remove the
-    /// surplus; `None` if there are no prune steps.
-    pub fn min_start_count_fraction(&self) -> Option<f64> {
-        self.prunes.then_some(MIN_START_COUNT_FRACTION)
     }
 
     /// Returns the resource estimate (bytes of memory, seconds) of refinement for the input `work`. The memory holds
@@ -268,7 +254,7 @@ impl RefineStage {
             ("views", view_bytes.max(work.input.prepared)),
         ];
         // Peak memory is the maximum of three phases: rendering the original, optimizing constant deltas of the
-        // survivors (Gaussians left by pruning), and optimizing deltas that vary with time.
+        // survivors, and optimizing deltas that vary with time.
         let phase = |part: f64, more: Option<MemoryPart>| -> Vec<MemoryPart> {
             let parts = left_readers.into_iter().chain(left).chain(more);
             parts.map(|(name, bytes)| (name, bytes_of_survivors(part, bytes))).collect()
@@ -281,7 +267,7 @@ impl RefineStage {
         let keyframe_steps = (keyframe_count > 0)
             .then(|| phase(wanted, Some(("trajectory delta", keyframe_count as u64 * keyframe_bytes))));
         let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
-        let first = wanted.max(self.min_start_count_fraction().unwrap_or(0.0));
+        let first = if self.prunes { wanted.max(MIN_START_COUNT_FRACTION) } else { wanted };
         let stages = [Some(original), Some(phase(first, None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
         // There may be fewer views than are asked for. Their number is 0 if it is not known.
@@ -289,9 +275,9 @@ impl RefineStage {
         let (target_views, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let last_count = (wanted * 1e6) as usize;
-        let prune_counts =
-            prune_counts(start_count(self.min_start_count_fraction(), last_count, 1_000_000), last_count);
-        let final_steps = self.final_step_count_for(wanted);
+        let first_count = if self.prunes { start_count(last_count, 1_000_000) } else { last_count };
+        let prune_counts = prune_counts(first_count, last_count);
+        let final_steps = self.final_step_count(last_count, 1_000_000);
         let steps = final_steps + if keyframe_count > 0 { along_time(final_steps) } else { 0 };
         let validations = if self.validates { 4.0 } else { 2.0 };
         let validation_renders = target_views / targets::validation_every(own + between) as f64 * validations;
@@ -332,15 +318,14 @@ impl RefineStage {
     }
 }
 
-/// Returns the number of Gaussians with which refinement begins. If there are prune steps, it is the larger of
-/// `target_count`, the number with which refinement ends, and the fraction `starts_at` of the `all` Gaussians of the
-/// model; prune steps then remove the surplus. Without prune steps (`starts_at` is `None`), it is `target_count`.
-pub(crate) fn start_count(starts_at: Option<f64>, target_count: usize, all: usize) -> usize {
-    starts_at.map_or(target_count, |part| target_count.max((part * all as f64).ceil() as usize).min(all))
+/// Returns the number of Gaussians with which a refinement with prune steps begins: the larger of `target_count`, the
+/// number with which it ends, and the fraction [`MIN_START_COUNT_FRACTION`] of the `all` Gaussians of the model.
+pub(crate) fn start_count(target_count: usize, all: usize) -> usize {
+    target_count.max((MIN_START_COUNT_FRACTION * all as f64).ceil() as usize).min(all)
 }
 
-/// Returns the number of optimization steps of the trajectory delta (values that vary with time), which is optimized
-/// after the constant delta: two thirds of `steps`, the number of steps of the constant delta.
+/// Returns the number of optimization steps of the trajectory delta, which is optimized after the constant delta: two
+/// thirds of `steps`, the number of steps of the constant delta.
 fn along_time(steps: usize) -> usize {
     2 * steps / 3
 }

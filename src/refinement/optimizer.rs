@@ -101,8 +101,7 @@ impl Adam {
         self.columns.iter().any(|column| self.change.0.attribute_values(column).planes().iter().any(|&x| x != 0.0))
     }
 
-    /// Returns the delta (current parameters minus start parameters) and resets it to 0. The caller has to add the
-    /// returned delta to the start parameters.
+    /// Returns the delta and resets it to 0. The caller has to add the returned delta to the start parameters.
     pub fn take_delta(&mut self) -> ParamDelta {
         let moved = self.change.clone();
         self.change.0.selected_attribute_values_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
@@ -122,14 +121,14 @@ impl Adam {
         self.done = 0;
     }
 
-    /// Returns the values that a checkpoint stores and [`Adam::resume`] takes: delta (current parameters minus start
-    /// parameters), running means of the gradient and its square, and number of steps.
+    /// Returns the values that a checkpoint stores and [`Adam::resume`] takes: delta, running means of the gradient and
+    /// its square, and number of steps.
     pub fn checkpoint(&self) -> (&ParamDelta, &[Gaussians; 2], usize) {
         (&self.change, &self.means, self.done)
     }
 
-    /// Restores the values that [`Adam::checkpoint`] returned for an optimizer with the same start parameters: delta
-    /// (current parameters minus start parameters), running means, and number of steps.
+    /// Restores the values that [`Adam::checkpoint`] returned for an optimizer with the same start parameters: delta,
+    /// running means, and number of steps.
     pub fn resume(&mut self, (change, means, done): (ParamDelta, [Gaussians; 2], usize)) {
         (self.change, self.means, self.done) = (change, means, done);
     }

@@ -7,8 +7,8 @@ use std::num::NonZeroU32;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
-use super::loss::{Loss, RenderQuality, equalize_slope};
+use super::linearized::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
+use super::loss::{Loss, RenderQuality, equalize_gradient};
 use super::rounding::Rounding;
 use super::step_input::{StepFiles, StepInput};
 use super::targets::Targets;
@@ -68,8 +68,7 @@ pub(super) struct OptimizerState<'a> {
     varying: Attributes,
     /// State of each frame in `frames`, without the delta (change of the stored parameters) of `constant_optimizer`.
     linearized: LinearizedFrames,
-    /// Stored parameters, without the delta (change of these parameters) of `constant_optimizer`. Used only if the
-    /// model has a deformation field.
+    /// Stored parameters, without the delta of `constant_optimizer`. Used only if the model has a deformation field.
     stored: StoredParams,
     /// Part of the constant delta (change of the stored parameters since the start of refinement) that `stored` and the
     /// frame states `linearized` already include. The rest is the delta of `constant_optimizer`.
@@ -79,8 +78,7 @@ pub(super) struct OptimizerState<'a> {
     /// its deformation field cannot compute their derivatives.
     step_params: StepParams,
     constant_optimizer: Adam,
-    /// One optimizer per keyframe of the time-varying delta (values that refinement adds to each frame); empty if the
-    /// delta is constant in time.
+    /// One optimizer per keyframe of the time-varying delta; empty if the delta is constant in time.
     keyframe_optimizers: Vec<Adam>,
     /// Rounding of the parameters before every render; `None` if they are rendered as they are.
     rounding: Option<Rounding>,
@@ -190,8 +188,8 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Replaces the optimizer of the stored parameters, `constant_optimizer`, by a new one for the Gaussians that are
-    /// left. Its delta (change of the parameters) is 0. Also sets `stride`, the stride of the rendered pixels of
-    /// training views, for this number of Gaussians (see [`Loss::stride`]).
+    /// left. Its delta is 0. Also sets `stride`, the stride of the rendered pixels of training views, for this number
+    /// of Gaussians (see [`Loss::stride`]).
     fn start_optimizer(&mut self) {
         (self.reevaluated, self.prefetched) = (false, None);
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -341,9 +339,9 @@ impl<'a> OptimizerState<'a> {
         self.reevaluate_states()
     }
 
-    /// Moves the delta (change of the stored parameters) of `constant_optimizer` to `self.baked_delta`: adds it there
-    /// and resets it to 0 in the optimizer. If the model has a deformation field, also adds it to `self.stored`, the
-    /// parameters from which the field computes the frame states.
+    /// Moves the delta of `constant_optimizer` to `self.baked_delta`: adds it there and resets it to 0 in the
+    /// optimizer. If the model has a deformation field, also adds it to `self.stored`, the parameters from which the
+    /// field computes the frame states.
     fn bake_delta(&mut self) {
         if !self.constant_optimizer.has_moved() {
             return;
@@ -378,7 +376,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the delta of `constant_optimizer` that renders show: rounded to the quantization grids, if there are any.
+    /// Returns the delta of `constant_optimizer` that renders show: rounded to the quantization grids, if there are
+    /// any.
     fn rendered_delta(&self) -> Cow<'_, ParamDelta> {
         let delta = self.constant_optimizer.delta();
         match &self.rounding {
@@ -424,9 +423,9 @@ impl<'a> OptimizerState<'a> {
         StepFiles { targets, stride, frames, linearized }
     }
 
-    /// Makes one optimization step of the constant delta (change of the stored parameters), on target view `k` with the
-    /// learning rates of `schedule`. `next`: target view of the next step, whose data are then read during this step if
-    /// there are several threads; `None` if something else uses this optimizer before the next step.
+    /// Makes one optimization step of the constant delta, on target view `k` with the learning rates of `schedule`.
+    /// `next`: target view of the next step, whose data are then read during this step if there are several threads;
+    /// `None` if something else uses this optimizer before the next step.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read or written.
@@ -442,8 +441,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Makes one optimization step of the time-varying delta (values added to each frame), on target view `k` with the
-    /// learning rates of `schedule`. `next`: as in [`OptimizerState::step`].
+    /// Makes one optimization step of the time-varying delta, on target view `k` with the learning rates of `schedule`.
+    /// `next`: as in [`OptimizerState::step`].
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
@@ -480,9 +479,9 @@ impl<'a> OptimizerState<'a> {
         let OptimizerState { scene, targets, stride, ref frames, ref linearized, .. } = *self;
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
         let pull = |render: &_| {
-            let mut slope = loss.slope(render, &target);
-            equalize_slope(&mut slope);
-            (0.0, slope)
+            let mut gradient = loss.gradient(render, &target);
+            equalize_gradient(&mut gradient);
+            (0.0, gradient)
         };
         let (renderer, view) = (&mut self.renderer, targets.view(k, stride));
         let next = next.filter(|_| rayon::current_num_threads() > 1);

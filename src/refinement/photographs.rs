@@ -3,9 +3,9 @@
 
 use std::path::Path;
 
+use super::RefineStage;
 use super::run::RefineRun;
 use super::targets::Targets;
-use super::{NO_GAIN, RefineStage};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
@@ -96,11 +96,8 @@ impl RefineStage {
                     journal.photographs = Some(PhotographSummary { photographs: held_back, before, result });
                 }
                 None => {
-                    let not_closer =
-                        || format!("the {held_back} photographs that were held back did not become closer");
-                    // Another reason, such as a PSNR that is not a number, is in the journal of the fit.
-                    let other = own.left_out.into_iter().find(|left| !left.why.starts_with(NO_GAIN));
-                    journal.leave_out(FIT, other.map_or_else(not_closer, |left| left.why));
+                    let why = own.left_out.into_iter().next().map_or_else(String::new, |left| left.why);
+                    journal.leave_out(FIT, why);
                 }
             }
             Ok((result, count))

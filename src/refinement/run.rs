@@ -10,7 +10,7 @@ use super::optimizer::RateSchedule;
 use super::optimizer_state::{LoadedCheckpoint, OptimizerState, keyframe_count};
 use super::survivors::survivors;
 use super::targets::{Targets, ViewSplit};
-use super::{MAX_USEFUL_PSNR, NAME, NO_GAIN, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
+use super::{MAX_USEFUL_PSNR, NAME, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
 use crate::cache::CacheKey;
 use crate::compressed_model::{CompressedModel, ParamDelta, TrajectoryDelta};
 use crate::error::Result;
@@ -182,18 +182,18 @@ struct ResumePoint<Checkpoint, Best> {
     checkpoint: Checkpoint,
     /// Best parameter deltas so far, if the phase is the final steps. `None` in the steps before a prune step, because
     /// these are not validated.
-    best_state: Option<Best>,
+    best_deltas: Option<Best>,
 }
 
 /// Parameter deltas (values that refinement adds to the model) that have had the best validation quality in the final
 /// optimization steps.
 #[derive(Clone, Serialize, Deserialize)]
-struct BestState {
+struct BestDeltas {
     before: RenderQuality,
     best: RenderQuality,
     /// Best validation quality so far of renders without the trajectory delta (values that vary with time).
     constant: RenderQuality,
-    /// Constant delta (values added to the stored parameters) that has had the best validation quality so far.
+    /// Constant delta that has had the best validation quality so far.
     delta: ParamDelta,
     /// Factor on the learning rates, reduced at each validation (except the last) that shows no better quality than the
     /// best so far.
@@ -206,7 +206,7 @@ struct BestState {
 
 /// Progress of a phase that continues from a checkpoint: number of optimization steps done, learning rates, and, in the
 /// final steps, the best parameter deltas (added values) so far.
-type Resumed = (usize, RateSchedule, Option<BestState>);
+type Resumed = (usize, RateSchedule, Option<BestDeltas>);
 
 impl<'a> RefineRun<'a> {
     /// Creates a refinement that the stage named `stage` runs. `refine`: parameters. `targets`: target views.
@@ -274,7 +274,8 @@ impl<'a> RefineRun<'a> {
             let steps = self.refine.steps_before(pair[0], target_count);
             left = left.pick(&self.prune_step(&mut optimizer, &mut timer, steps, pair[1])?);
         }
-        let BestState { delta, trajectory, best, .. } = self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
+        let BestDeltas { delta, trajectory, best, .. } =
+            self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
         (left.delta, left.trajectory_delta) = (left.delta.plus(delta), left.trajectory_delta.plus(trajectory));
         Ok((left, best.psnr))
     }
@@ -302,8 +303,8 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs the final optimization steps on the model `compressed`. Returns this model with the parameter deltas
-    /// (values that refinement adds) that have given the best validation quality.
+    /// Runs the final optimization steps on the model `compressed`. Returns this model with the parameter deltas that
+    /// have given the best validation quality.
     pub(crate) fn refine_best(
         &mut self,
         mut compressed: CompressedModel,
@@ -311,22 +312,22 @@ impl<'a> RefineRun<'a> {
     ) -> Result<CompressedModel> {
         let steps = self.refine.final_step_count(compressed.len(), self.scored.gaussian_count());
         let (key, work) = (self.key(&compressed, compressed.len(), compressed.len()), &self.scene.work);
-        let (change, course, taken) = journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
+        let (delta, trajectory, taken) = journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
             self.set_total_steps(steps + self.steps_along_time(steps));
             let mut timer = self.timer(key);
             let result = self.scene.input.compressed_frames(&compressed)?;
             let mut optimizer = self.start_optimizer(&compressed, &*result)?;
-            let BestState { delta, trajectory, .. } = self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
+            let BestDeltas { delta, trajectory, .. } = self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
             Ok((delta, trajectory, self.sampler.taken))
         })?;
         self.sampler.skip_to(taken);
         (compressed.delta, compressed.trajectory_delta) =
-            (compressed.delta.plus(change), compressed.trajectory_delta.plus(course));
+            (compressed.delta.plus(delta), compressed.trajectory_delta.plus(trajectory));
         Ok(compressed)
     }
 
-    /// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame); 0 if the
-    /// added values are constant in time, as for inputs without explicit frames.
+    /// Returns the number of keyframes of the time-varying delta; 0 if the added values are constant in time, as for
+    /// inputs without explicit frames.
     fn keyframe_count(&self) -> usize {
         match self.scene.input.description().has_explicit_frames {
             true => keyframe_count(self.refine.keyframes, self.scene.source().info().times.len()),
@@ -334,9 +335,8 @@ impl<'a> RefineRun<'a> {
         }
     }
 
-    /// Returns the number of optimization steps of the time-varying delta (values added to each frame), which follow
-    /// `steps` steps of the constant delta (values added to the stored parameters); 0 if there is no time-varying
-    /// delta.
+    /// Returns the number of optimization steps of the time-varying delta, which follow `steps` steps of the constant
+    /// delta; 0 if there is no time-varying delta.
     fn steps_along_time(&self, steps: usize) -> usize {
         if self.keyframe_count() > 0 { along_time(steps) } else { 0 }
     }
@@ -360,31 +360,30 @@ impl<'a> RefineRun<'a> {
     /// Restores the optimizer and the position in the random order of views from the last checkpoint of the current
     /// phase of `timer`. Returns the progress of this phase, or `None` if there is no checkpoint of it.
     fn resume(&mut self, optimizer: &mut OptimizerState<'_>, timer: &CheckpointTimer) -> Result<Option<Resumed>> {
-        let kept: Option<ResumePoint<LoadedCheckpoint, BestState>> =
+        let kept: Option<ResumePoint<LoadedCheckpoint, BestDeltas>> =
             self.scene.work.load(&self.checkpoint_name(), timer.key)?;
         let Some(kept) = kept.filter(|kept| kept.phase == timer.phase) else { return Ok(None) };
         optimizer.resume(kept.checkpoint)?;
         self.sampler.skip_to(kept.taken);
         self.progress.advance(kept.steps as u64);
-        Ok(Some((kept.steps, kept.schedule, kept.best_state)))
+        Ok(Some((kept.steps, kept.schedule, kept.best_deltas)))
     }
 
-    /// Writes a checkpoint of the current phase (one prune step with its optimization steps, or the final steps), after
-    /// `steps` optimization steps of this phase. `schedule`: learning rates. `best_state`: best parameter deltas so
-    /// far, `None` before the final steps. Does nothing if less time than `timer.interval` has passed since the last
-    /// checkpoint, or if the cache is disabled.
+    /// Writes a checkpoint of the current phase, after `steps` optimization steps of this phase. `schedule`: learning
+    /// rates. `best_deltas`: best parameter deltas so far, `None` before the final steps. Does nothing if less time
+    /// than `timer.interval` has passed since the last checkpoint, or if the cache is disabled.
     fn save_checkpoint(
         &self,
         optimizer: &OptimizerState<'_>,
         timer: &mut CheckpointTimer,
         (steps, schedule): (usize, RateSchedule),
-        best_state: Option<&BestState>,
+        best_deltas: Option<&BestDeltas>,
     ) -> Result<()> {
         if !self.scene.work.is_enabled() || timer.saved_at.elapsed() < timer.interval {
             return Ok(());
         }
         let (phase, taken) = (timer.phase, self.sampler.taken);
-        let kept = ResumePoint { phase, steps, taken, schedule, checkpoint: optimizer.checkpoint(), best_state };
+        let kept = ResumePoint { phase, steps, taken, schedule, checkpoint: optimizer.checkpoint(), best_deltas };
         let start = Instant::now();
         self.scene.work.store(&self.checkpoint_name(), timer.key, &kept)?;
         timer.saved_at = Instant::now();
@@ -437,23 +436,23 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs `steps` optimization steps of the constant delta (values added to the stored parameters), then the steps of
-    /// the time-varying delta (values added to each frame). Returns the deltas with the best validation quality.
-    /// Records in `journal` the gain in validation PSNR, or the reason why nothing was gained.
+    /// Runs `steps` optimization steps of the constant delta, then the steps of the time-varying delta. Returns the
+    /// deltas with the best validation quality. Records in `journal` the gain in validation PSNR, or the reason why
+    /// nothing was gained.
     fn final_steps(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
         timer: &mut CheckpointTimer,
         steps: usize,
         journal: &mut Journal,
-    ) -> Result<BestState> {
+    ) -> Result<BestDeltas> {
         let count = self.validation.len();
-        let (done, mut schedule, mut best_state) = match self.resume(optimizer, timer)? {
-            Some((done, schedule, Some(best_state))) => (done, schedule, best_state),
+        let (done, mut schedule, mut best_deltas) = match self.resume(optimizer, timer)? {
+            Some((done, schedule, Some(best_deltas))) => (done, schedule, best_deltas),
             _ => {
                 optimizer.reevaluate_states()?;
                 let before = optimizer.quality(&self.validation)?;
-                let best_state = BestState::new(before, optimizer.change());
+                let best_deltas = BestDeltas::new(before, optimizer.change());
                 if before.psnr.is_nan() || before.psnr >= MAX_USEFUL_PSNR {
                     let why = match before.psnr.is_nan() {
                         true => {
@@ -462,9 +461,9 @@ impl<'a> RefineRun<'a> {
                         false => format!("the {count} validation views have {:.2} dB PSNR without it", before.psnr),
                     };
                     journal.leave_out("refinement", why);
-                    return Ok(best_state);
+                    return Ok(best_deltas);
                 }
-                (0, RateSchedule::new(steps, LAST_RATE_OF_FINAL_STEPS, before.typical_error()), best_state)
+                (0, RateSchedule::new(steps, LAST_RATE_OF_FINAL_STEPS, before.typical_error()), best_deltas)
             }
         };
         let validate_every = steps.div_ceil(3).clamp(VALIDATE_EVERY[0], VALIDATE_EVERY[1]);
@@ -472,45 +471,45 @@ impl<'a> RefineRun<'a> {
             let is_validated = self.refine.validates && step % validate_every == 0 || step == steps;
             self.step(!is_validated, |view, next| optimizer.step(view, next, &schedule))?;
             if is_averaged(step, steps) {
-                best_state.mean.add(optimizer.change());
+                best_deltas.mean.add(optimizer.change());
             }
             if is_validated {
-                match step == steps && best_state.mean.count > 0 {
-                    true => optimizer.restart_from(&best_state.mean.delta)?,
+                match step == steps && best_deltas.mean.count > 0 {
+                    true => optimizer.restart_from(&best_deltas.mean.delta)?,
                     false => optimizer.reevaluate_states()?,
                 }
                 let now = optimizer.quality(&self.validation)?;
-                if self.keeps(&now, &best_state.best) {
-                    (best_state.best, best_state.delta) = (now, optimizer.change());
+                if self.keeps(&now, &best_deltas.best) {
+                    (best_deltas.best, best_deltas.delta) = (now, optimizer.change());
                 } else if step < steps {
-                    best_state.mean = MeanDelta::default();
-                    best_state.rate_factor *= RATE_REDUCTION;
-                    optimizer.restart_from(&best_state.delta)?;
+                    best_deltas.mean = MeanDelta::default();
+                    best_deltas.rate_factor *= RATE_REDUCTION;
+                    optimizer.restart_from(&best_deltas.delta)?;
                     schedule =
-                        RateSchedule::new(steps - step, LAST_RATE_OF_FINAL_STEPS, best_state.best.typical_error())
-                            .scaled_by(best_state.rate_factor);
+                        RateSchedule::new(steps - step, LAST_RATE_OF_FINAL_STEPS, best_deltas.best.typical_error())
+                            .scaled_by(best_deltas.rate_factor);
                 }
             }
-            best_state.constant = best_state.best;
-            self.save_checkpoint(optimizer, timer, (step, schedule), Some(&best_state))?;
+            best_deltas.constant = best_deltas.best;
+            self.save_checkpoint(optimizer, timer, (step, schedule), Some(&best_deltas))?;
         }
-        let is_along = self.refine_along_time(optimizer, timer, (done, schedule), &mut best_state, steps)?;
-        let [start, best] = [best_state.before.psnr, best_state.best.psnr];
-        if self.keeps(&best_state.best, &best_state.before) {
+        let is_along = self.refine_along_time(optimizer, timer, (done, schedule), &mut best_deltas, steps)?;
+        let [start, best] = [best_deltas.before.psnr, best_deltas.best.psnr];
+        if self.keeps(&best_deltas.best, &best_deltas.before) {
             journal.notes.push(format!("refinement: validation PSNR {start:.2} → {best:.2} dB ({count} views)"));
             journal.refined = Some(RefinedSummary { views: count, before: start, result: best });
         } else {
-            let why = format!("{NO_GAIN} of {start:.2} dB ({count} views)");
+            let why = format!("it did not improve the validation PSNR of {start:.2} dB ({count} views)");
             journal.leave_out("refinement", why);
         }
-        if !best_state.trajectory.is_empty() {
-            let gain = best - best_state.constant.psnr;
+        if !best_deltas.trajectory.is_empty() {
+            let gain = best - best_deltas.constant.psnr;
             journal.notes.push(format!("refinement: {gain:.2} dB of this gain are due to changes along time"));
         } else if is_along {
             let why = format!("they did not improve the validation PSNR of {best:.2} dB");
             journal.leave_out("changes along time", why);
         }
-        Ok(best_state)
+        Ok(best_deltas)
     }
 
     /// Returns whether the current parameters, of validation quality `now`, replace the best parameters so far, of
@@ -519,9 +518,9 @@ impl<'a> RefineRun<'a> {
         self.refine.loss.is_closer(now, best) || !self.refine.validates && !now.psnr.is_nan()
     }
 
-    /// Runs the optimization steps of the time-varying delta (values added to each frame), and stores the best deltas
-    /// in `best_state`. These steps follow the `steps` steps of the constant delta (values added to the stored
-    /// parameters). `done`: number of steps of both deltas in the loaded checkpoint; 0 without a checkpoint.
+    /// Runs the optimization steps of the time-varying delta, and stores the best deltas in `best_deltas`. These steps
+    /// follow the `steps` steps of the constant delta. `done`: number of steps of both deltas in the loaded checkpoint;
+    /// 0 without a checkpoint.
     /// - If `done` is above `steps`, continues from the checkpoint with the learning rates `schedule`.
     /// - Otherwise starts from the best constant delta.
     ///
@@ -532,16 +531,16 @@ impl<'a> RefineRun<'a> {
         optimizer: &mut OptimizerState<'_>,
         timer: &mut CheckpointTimer,
         (done, mut schedule): (usize, RateSchedule),
-        best_state: &mut BestState,
+        best_deltas: &mut BestDeltas,
         steps: usize,
     ) -> Result<bool> {
         let keyframe_steps = self.steps_along_time(steps);
-        if keyframe_steps == 0 || best_state.constant.psnr >= MAX_USEFUL_PSNR {
+        if keyframe_steps == 0 || best_deltas.constant.psnr >= MAX_USEFUL_PSNR {
             return Ok(false);
         }
         if done <= steps {
             let keyframe_count = self.keyframe_count();
-            optimizer.restart_from(&best_state.delta)?;
+            optimizer.restart_from(&best_deltas.delta)?;
             if !optimizer.enable_keyframes(keyframe_count) {
                 return Ok(false);
             }
@@ -549,7 +548,7 @@ impl<'a> RefineRun<'a> {
             schedule = RateSchedule::new(
                 2 * keyframe_steps / keyframe_count,
                 LAST_RATE_OF_FINAL_STEPS,
-                best_state.constant.error,
+                best_deltas.constant.error,
             );
         }
         let validate_every = keyframe_steps.div_ceil(3);
@@ -558,22 +557,22 @@ impl<'a> RefineRun<'a> {
             self.step(!is_validated, |view, next| optimizer.step_trajectory(view, next, &schedule))?;
             if is_validated {
                 let now = optimizer.quality(&self.validation)?;
-                let gains = self.refine.loss.ssim > 0.0 || now.psnr >= best_state.best.psnr + MIN_KEYFRAME_GAIN;
-                if (gains || !self.refine.validates) && self.keeps(&now, &best_state.best) {
-                    (best_state.best, best_state.trajectory) = (now, optimizer.trajectory_delta());
+                let gains = self.refine.loss.ssim > 0.0 || now.psnr >= best_deltas.best.psnr + MIN_KEYFRAME_GAIN;
+                if (gains || !self.refine.validates) && self.keeps(&now, &best_deltas.best) {
+                    (best_deltas.best, best_deltas.trajectory) = (now, optimizer.trajectory_delta());
                 }
             }
-            self.save_checkpoint(optimizer, timer, (steps + step, schedule), Some(best_state))?;
+            self.save_checkpoint(optimizer, timer, (steps + step, schedule), Some(best_deltas))?;
         }
         Ok(true)
     }
 }
 
-impl BestState {
+impl BestDeltas {
     /// Creates the best state before any optimization step: `delta` is the change of the parameters so far, and
     /// `before` the validation quality with this change.
     fn new(before: RenderQuality, delta: ParamDelta) -> Self {
-        BestState {
+        BestDeltas {
             before,
             best: before,
             constant: before,

@@ -3,7 +3,7 @@
 
 use std::num::NonZeroU32;
 
-use super::local::{LinearizedFrames, LinearizedState};
+use super::linearized::{LinearizedFrames, LinearizedState};
 use super::targets::Targets;
 use crate::error::Result;
 

@@ -153,9 +153,9 @@ enum Purpose {
 }
 
 impl Targets {
-    /// Renders the views of the original that `params` asks for, fewer if they would exceed [`MAX_BYTES`]. Stores them in
-    /// a scratch file. Returns these target views. Of training views only every `stride`-th column and row of pixels is
-    /// rendered. If `has_test_views`, every fourth view is a test view; otherwise there are no test views.
+    /// Renders the views of the original that `params` asks for, fewer if they would exceed [`MAX_BYTES`]. Stores them
+    /// in a scratch file. Returns these target views. Of training views only every `stride`-th column and row of pixels
+    /// is rendered. If `has_test_views`, every fourth view is a test view; otherwise there are no test views.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.

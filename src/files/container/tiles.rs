@@ -339,7 +339,7 @@ impl<'a> TileReader<'a> {
         let now = self.announced_block.is_none().then_some((frame_block, want));
         self.announced_block = Some(frame_block);
         let end = reader.layout().frame_range(frame_block, self.source.info.times.len() as u64).end as usize;
-        let next = self.plan.next_planned(end).map(|next| (self.frame_block(next), want & source.info.varying));
+        let next = self.plan.first_planned_from(end).map(|next| (self.frame_block(next), want & source.info.varying));
         for (frame_block, columns) in now.into_iter().chain(next) {
             let runs = self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block);
             reader.prefetch_in_background(

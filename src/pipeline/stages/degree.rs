@@ -14,11 +14,11 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::pipeline::planning::Planning;
-use crate::pipeline::stage::{ByteLimitFit, EstimateInput, Phase, RunState, Stage, StageList};
+use crate::pipeline::stage::{ByteLimitFit, CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
+use crate::refinement::RefineStage;
 use crate::refinement::targets::Targets;
-use crate::refinement::{RefineStage, start_count};
 use crate::scene::Scene;
 
 /// Name of this stage in plans, progress and summaries.
@@ -84,9 +84,9 @@ impl Degree {
         let gaussian_count = scored.gaussian_count();
         let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
         journal.run_cached_stage(NAME, gaussian_count, scene, key, |journal| {
-            let min_fraction = self.refine.min_start_count_fraction();
+            let counts = CountPlan { prunes_in_refinement: self.refine.prunes, searches: false };
             let initial_count =
-                |gaussians: usize| start_count(min_fraction, gaussians, gaussian_count).min(ranked.order().len());
+                |gaussians: usize| counts.count_before_refinement(gaussians, gaussian_count).min(ranked.order().len());
             let largest = fits.iter().map(|fit| initial_count(fit.gaussians)).max().unwrap_or_default();
             let stride = self.refine.stored_stride(scene.workload().pixels, largest);
             let targets = Targets::new(scene, self.refine.target_views, stride, false)?;

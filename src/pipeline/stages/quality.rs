@@ -24,7 +24,7 @@ use crate::journal::Journal;
 use crate::journal::records::{QualitySummary, RenderTime, ViewKind};
 use crate::limits::Limits;
 use crate::memory_plan::{RENDER_COST, ResourceEstimate, Workload, bytes_of_survivors};
-use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
+use crate::metrics::{METRIC_BYTES_PER_PIXEL, psnr, ssim};
 use crate::model::{Attributes, FrameView};
 use crate::models::InputModel;
 use crate::outputs::kind::{Fidelity, OutputKind};
@@ -177,7 +177,7 @@ impl QualityStage {
     /// `output_fraction`: number of Gaussians in the result divided by that in the input.
     fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.frame_views.max(1));
-        let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
+        let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + METRIC_BYTES_PER_PIXEL as u64);
         let is_read_back = self.is_measured_once_written() && !self.reads_no_output();
         let written = if is_read_back { WRITTEN_COPIES * work.state_bytes(Attributes::all()) } else { 0 };
         let result = vec![

@@ -2,8 +2,8 @@
 //! frames).
 //!
 //! Input: pairs of [`Image`]s of equal size. Output: one f64 per pair. Values are clamped to [0, 1] first, as on a
-//! screen, and all sums are in f64. Memory: [`BYTES_PER_PIXEL`] per pixel; FLIP takes what the code of its authors
-//! needs.
+//! screen, and all sums are in f64. Memory: [`METRIC_BYTES_PER_PIXEL`] per pixel; FLIP takes what the code of its
+//! authors needs.
 
 mod flip;
 mod ssim;
@@ -14,11 +14,11 @@ pub use ssim::{ssim, ssim_gradient};
 use crate::Image;
 
 /// Maximum bytes of memory per pixel for comparing two images by a metric other than FLIP. SSIM takes this much.
-pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
+pub const METRIC_BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
 
 /// Bytes of memory per pixel for [`ssim_gradient`]: the sums of SSIM for three channels, and two copies of the
 /// derivatives, in f64 and f32.
-pub const SSIM_SLOPE_BYTES_PER_PIXEL: usize = 3 * (BYTES_PER_PIXEL + size_of::<f64>() + size_of::<f32>());
+pub const SSIM_GRADIENT_BYTES_PER_PIXEL: usize = 3 * (METRIC_BYTES_PER_PIXEL + size_of::<f64>() + size_of::<f32>());
 
 /// Maximum PSNR in dB, which equal images get instead of infinity. It keeps the mean over views finite.
 pub const PSNR_CAP_DB: f64 = 100.0;
