@@ -16,7 +16,7 @@ use crate::error::{Error, Result, ShowPath, quoted};
 
 /// Name of the summary file, which identifies a folder as a result of this program. The file is a JSON object. Its
 /// member `tool` names the program, and its member `files` lists the files of the result.
-/// [`super::StagedFolder::commit`] and [`super::StagedFiles::commit`] add this list.
+/// [`super::StagedFolder::commit`] and [`super::StagedFile::commit`] add this list.
 pub const SUMMARY_FILE: &str = "summary.json";
 
 /// Maximum size in bytes of a file that is read as a summary: 16 MiB, enough to list about 500,000 files. Larger files
