@@ -17,7 +17,6 @@ for target in "${targets[@]}"; do
     saved=../tests/corpus/$target
     case $target in
         recover) saved=../tests/corpus/container ;;
-        cameras_json) saved=../tests/corpus/cameras ;;
     esac
     mkdir -p "corpus/$target"
     # The target counts allocated memory itself; the limit here is for other memory.

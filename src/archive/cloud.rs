@@ -93,7 +93,7 @@ pub(super) struct PointCloudShape {
 /// Plane (scalar component of all Gaussians) that is coded after the positions.
 #[derive(Debug, Clone, Copy)]
 struct Plane {
-    source: PlaneSource,
+    source: PlaneOrigin,
     /// Group of planes with which this plane shares its quantization step and entropy models. The planes of an
     /// attribute are one group: its index in [`ATTRIBUTES`]. The planes of a column are one group: the number of
     /// attributes plus the index of the column.
@@ -102,7 +102,7 @@ struct Plane {
 
 /// Origin of the values of a [`Plane`]: an attribute or a [`Column`].
 #[derive(Debug, Clone, Copy)]
-enum PlaneSource {
+enum PlaneOrigin {
     /// Attribute, and index of the scalar component of this attribute that the plane holds.
     Attribute(Attributes, usize),
     /// Index of a [`Column`], and index of the scalar component of this column that the plane holds.
@@ -111,7 +111,7 @@ enum PlaneSource {
 
 /// Returns the planes (scalar components) of the attributes in coding order, without the three of the position.
 fn attribute_planes(sh_degree: usize) -> Vec<Plane> {
-    let plane = |attribute, c, group| Plane { source: PlaneSource::Attribute(attribute, c), group };
+    let plane = |attribute, c, group| Plane { source: PlaneOrigin::Attribute(attribute, c), group };
     let mut planes: Vec<_> = (0..4).map(|c| plane(Attributes::ROTATION, c, 1)).collect();
     planes.extend((0..3).map(|c| plane(Attributes::LOG_SCALE, c, 2)));
     planes.push(plane(Attributes::OPACITY, 0, 3));
@@ -148,7 +148,7 @@ impl PointCloudShape {
         let mut planes = attribute_planes(self.sh_degree);
         for (k, column) in self.columns.iter().enumerate() {
             let group = ATTRIBUTES.len() + k;
-            planes.extend((0..column.planes).map(|c| Plane { source: PlaneSource::Column(k, c), group }));
+            planes.extend((0..column.planes).map(|c| Plane { source: PlaneOrigin::Column(k, c), group }));
         }
         planes
     }
@@ -265,9 +265,9 @@ pub(super) fn encode(
     for coded in shape.planes() {
         let (grid, group) = (shape.grid(coded), coded.group);
         let plane = match coded.source {
-            PlaneSource::Attribute(Attributes::ROTATION, c) => rotation.plane(c),
-            PlaneSource::Attribute(attribute, c) => cloud.attribute_values(attribute).plane(c),
-            PlaneSource::Column(k, c) => columns[k].values.plane(c),
+            PlaneOrigin::Attribute(Attributes::ROTATION, c) => rotation.plane(c),
+            PlaneOrigin::Attribute(attribute, c) => cloud.attribute_values(attribute).plane(c),
+            PlaneOrigin::Column(k, c) => columns[k].values.plane(c),
         };
         let multiples: Vec<i64> = order.iter().map(|&id| grid.multiple(plane[id as usize])).collect();
         let sum: i128 = multiples.iter().map(|&multiple| i128::from(multiple)).sum();
@@ -321,8 +321,8 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
         let (grid, mean) = (shape.grid(coded), shape.means[k]);
         let factors = factors(&shape.weights[k]);
         let plane = match coded.source {
-            PlaneSource::Attribute(attribute, c) => cloud.attribute_values_mut(attribute).plane_mut(c),
-            PlaneSource::Column(column, c) => columns[column].values.plane_mut(c),
+            PlaneOrigin::Attribute(attribute, c) => cloud.attribute_values_mut(attribute).plane_mut(c),
+            PlaneOrigin::Column(column, c) => columns[column].values.plane_mut(c),
         };
         coder.code_plane(coded.group, grid, mean, |i, around, size, models| {
             let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
@@ -430,8 +430,8 @@ impl PlaneCoder {
 fn components(sh_degree: usize) -> impl Iterator<Item = (Attributes, usize, usize)> {
     let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
     positions.chain(attribute_planes(sh_degree).into_iter().filter_map(|plane| match plane.source {
-        PlaneSource::Attribute(attribute, c) => Some((attribute, c, plane.group)),
-        PlaneSource::Column(..) => None,
+        PlaneOrigin::Attribute(attribute, c) => Some((attribute, c, plane.group)),
+        PlaneOrigin::Column(..) => None,
     }))
 }
 
@@ -453,9 +453,9 @@ fn nonzero_rotations(rotation: &AttributeValues, grid: QuantizationGrid) -> Attr
     nonzero
 }
 
-/// Rounds attributes of the Gaussians `cloud` in place to the quantization grids of `steps`. `attributes` lists the
-/// attributes to round, as indices in [`ATTRIBUTES`].
-pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
+/// Rounds attributes of the Gaussians `cloud` in place to the quantization grids of `steps`, as an archive would, but
+/// keeps the order of the Gaussians. `attributes` lists the attributes to round, as indices in [`ATTRIBUTES`].
+pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     if attributes.contains(&1) {
         cloud.rotation = nonzero_rotations(&cloud.rotation, QuantizationGrid::new(steps[1]));
     }
@@ -466,15 +466,20 @@ pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usi
     }
 }
 
+/// Rounds the values of `column` to the quantization grid with the step 2^(`step`/8), as an archive would.
+pub fn round_column(column: &mut Column, step: i32) {
+    round_all(column.values.planes_mut(), step);
+}
+
 /// Rounds `values` to the quantization grid with the step 2^(`step`/8).
-pub(super) fn round_all(values: &mut [f32], step: i32) {
+fn round_all(values: &mut [f32], step: i32) {
     let grid = QuantizationGrid::new(step);
     values.iter_mut().for_each(|value| *value = grid.round(*value));
 }
 
-/// Returns the values of the attribute [`ATTRIBUTES`]`[attribute]`: the first scalar component of all Gaussians, then
-/// the second scalar component of all Gaussians, and so on.
-pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
-    let own = components(cloud.sh_degree()).filter(move |plane| plane.2 == attribute);
+/// Returns the values of the attribute [`ATTRIBUTES`]`[k]` of the Gaussians `cloud`: the first scalar component of all
+/// Gaussians, then the second, and so on.
+pub fn attribute_values(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
+    let own = components(cloud.sh_degree()).filter(move |plane| plane.2 == k);
     own.flat_map(|(column, c, _)| cloud.attribute_values(column).plane(c).iter().copied())
 }

@@ -81,34 +81,14 @@ impl ArchiveSize {
     }
 }
 
-/// Defect of an archive: its place in the file, the expected content and the content found. Does not contain the path
-/// of the file.
-#[derive(Debug)]
-pub(super) struct Damage {
-    place: String,
-    expected: String,
-    found: String,
-    /// Advice to the user, shown with the error message.
-    advice: &'static str,
-}
-
-/// Advice to the user for a damaged archive.
-const COPY_AGAIN: &str = "the archive is damaged or cut short; copy it again";
 /// Advice to the user for an archive of another version.
 const WRITE_AGAIN: &str = "write the archive again from its model with this version of splatsieve, or open it with the \
                            version that wrote it";
 
-impl Damage {
-    /// Creates a defect in the part `place` of the file, such as a section. `expected` and `found` describe the
-    /// expected content and the content found.
-    pub(super) fn new(place: &str, expected: impl Into<String>, found: impl Into<String>) -> Damage {
-        Damage { place: place.to_owned(), expected: expected.into(), found: found.into(), advice: COPY_AGAIN }
-    }
-
-    /// Returns an error for the user that describes this defect and names the file at `path`.
-    pub(super) fn in_file(self, path: &Path) -> Error {
-        Error::input(path, self.place, self.expected, self.found).hint(self.advice)
-    }
+/// Returns the error for a damaged part `place`, such as a section, of the archive at `path`. `expected` and `found`
+/// describe the expected content and the content found.
+pub(super) fn damage(path: &Path, place: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
+    Error::input(path, place, expected, found).hint("the archive is damaged or cut short; copy it again")
 }
 
 /// Returns the bytes of an archive with the contents `sections`, and its size by purpose.
@@ -155,43 +135,42 @@ pub(super) struct ArchiveHeader {
 }
 
 impl ArchiveHeader {
-    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more,
+    /// Parses the header of the file at `path`, which has `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more,
     /// or the whole file if it is shorter.
-    pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<ArchiveHeader, Damage> {
+    pub(super) fn parse(path: &Path, head: &[u8], whole: u64) -> Result<ArchiveHeader> {
         if !head.starts_with(&MAGIC) {
             let first = head.get(..8.min(head.len())).unwrap_or_default();
-            return Err(Damage::new("byte 0", "the first bytes of an archive (.gsz)", format!("{first:02x?}")));
+            return Err(damage(path, "byte 0", "the first bytes of an archive (.gsz)", format!("{first:02x?}")));
         }
         let version = head[MAGIC.len()..].first_chunk().map(|&bytes| u16::from_le_bytes(bytes));
         if let Some(found) = version.filter(|&version| version != VERSION) {
             let found = format!("version {found}, of another version of splatsieve");
-            let damage = Damage::new("byte 8", format!("version {VERSION}"), found);
-            return Err(Damage { advice: WRITE_AGAIN, ..damage });
+            return Err(Error::input(path, "byte 8", format!("version {VERSION}"), found).hint(WRITE_AGAIN));
         }
         let Some(head) = head.get(..HEADER_BYTES) else {
-            return Err(Damage::new("head", format!("{HEADER_BYTES} bytes"), format!("{whole} bytes")));
+            return Err(damage(path, "head", format!("{HEADER_BYTES} bytes"), format!("{whole} bytes")));
         };
         let number = |at: usize| head[at..at + 8].iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte));
         if number(HEADER_BYTES - 8) != xxh3_64(&head[..HEADER_BYTES - 8]) {
-            return Err(Damage::new("head", "its checksum", "another"));
+            return Err(damage(path, "head", "its checksum", "another"));
         }
         let sections = std::array::from_fn(|k| [0, 8, 16].map(|field| number(12 + 24 * k + field)));
         let mut rest = whole.saturating_sub(HEADER_BYTES as u64);
         for ([stored, content, _], name) in sections.into_iter().zip(NAMES) {
             let place = format!("section {name}");
             let Some(after) = rest.checked_sub(stored) else {
-                return Err(Damage::new(&place, format!("{stored} bytes"), format!("{rest} bytes")));
+                return Err(damage(path, &place, format!("{stored} bytes"), format!("{rest} bytes")));
             };
-            check_size(usize::try_from(content).ok(), whole)?;
+            check_size(path, usize::try_from(content).ok(), whole)?;
             rest = after;
         }
         if rest != 0 {
-            return Err(Damage::new("end", "nothing after the last section", format!("{rest} bytes")));
+            return Err(damage(path, "end", "nothing after the last section", format!("{rest} bytes")));
         }
         let table = sections[0][1];
         if table > MAX_TABLE_BYTES {
             let expected = format!("at most {MAX_TABLE_BYTES} bytes of content");
-            return Err(Damage::new("section table", expected, format!("{table} bytes")));
+            return Err(damage(path, "section table", expected, format!("{table} bytes")));
         }
         Ok(ArchiveHeader { whole, sections })
     }
@@ -211,26 +190,26 @@ impl ArchiveHeader {
     }
 }
 
-/// Returns the sections of the archive `bytes`, decompressed, and its size by purpose. `head` is its parsed header.
+/// Returns the sections of the archive `bytes`, which was read from `path`, decompressed, and its size by purpose. `head` is its parsed header.
 /// Fails if a checksum or a length is wrong.
-pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(Sections, ArchiveSize), Damage> {
+pub(super) fn read(path: &Path, head: &ArchiveHeader, bytes: &[u8]) -> Result<(Sections, ArchiveSize)> {
     let mut rest = &bytes[HEADER_BYTES..];
     let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
     for (k, name) in NAMES.iter().enumerate() {
         let [stored, _, checksum] = head.sections[k];
         // The header was parsed with the length of `bytes`, so this fails only if `bytes` changed.
         let Some((own, after)) = rest.split_at_checked(stored as usize) else {
-            return Err(Damage::new(name, format!("{stored} bytes"), format!("{} bytes", rest.len())));
+            return Err(damage(path, name, format!("{stored} bytes"), format!("{} bytes", rest.len())));
         };
         if xxh3_64(own) != checksum {
-            return Err(Damage::new(&format!("section {name}"), "its checksum", "another"));
+            return Err(damage(path, &format!("section {name}"), "its checksum", "another"));
         }
         (sections[k], rest) = (own, after);
     }
     let unpack = |k: usize| {
         let place = format!("section {}", NAMES[k]);
         let length = head.sections[k][1] as usize;
-        let wrong = |found: String| Damage::new(&place, format!("{length} bytes of content"), found);
+        let wrong = |found: String| damage(path, &place, format!("{length} bytes of content"), found);
         let content = zstd::bulk::decompress(sections[k], length).map_err(|error| wrong(error.to_string()))?;
         if content.len() == length { Ok(content) } else { Err(wrong(content.len().to_string())) }
     };
@@ -240,16 +219,16 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
     Ok((content, parts))
 }
 
-/// Checks that `bytes`, the size of the decoded content of an archive file of `length` bytes, is not suspiciously
-/// large. Fails if it exceeds 64 MiB plus 512 bytes per byte of the file. `None` stands for a number that overflowed
+/// Checks that `bytes`, the size of the decoded content of the archive at `path`, is not suspiciously large for a file
+/// of `length` bytes. Fails if it exceeds 64 MiB plus 512 bytes per byte of the file. `None` stands for a number that overflowed
 /// and fails as well.
-pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
+pub(super) fn check_size(path: &Path, bytes: Option<usize>, length: u64) -> Result<()> {
     let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {
         Some(bytes) if bytes <= most => Ok(()),
         bytes => {
             let found = bytes.map_or("a number that overflows".to_owned(), |bytes| bytes.to_string());
-            Err(Damage::new("table", format!("at most {most} bytes of content in {length}"), found))
+            Err(damage(path, "table", format!("at most {most} bytes of content in {length}"), found))
         }
     }
 }

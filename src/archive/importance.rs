@@ -38,10 +38,9 @@ pub fn step_offsets(
     space: Option<Box3>,
     times: [f32; 2],
 ) -> BTreeMap<String, Vec<i8>> {
-    let network = FieldWeights { tensors };
     let mut found = BTreeMap::new();
     let Some(space) = space else { return found };
-    let Some(trunk) = network.layers("deformation_net.feature_out", 0, 2) else { return found };
+    let Some(trunk) = trunk_layers(tensors) else { return found };
     // Inputs of the trunk (the layers that all heads share) at some samples, and for each plane the squares of the
     // factors that its values are multiplied by.
     let Some(samples) = Samples::new(tensors, position, space, times) else { return found };
@@ -59,7 +58,7 @@ pub fn step_offsets(
     let mut leaving = vec![0.0; trunk[trunk.len() - 1].outputs()];
     let active = active_fraction(&now, leaving.len());
     for name in heads(field) {
-        let Some([hidden, output]) = network.head(&name) else { continue };
+        let Some([hidden, output]) = head_layers(tensors, &name) else { continue };
         if hidden.inputs() != leaving.len() || output.inputs() != hidden.outputs() {
             continue;
         }
@@ -129,11 +128,6 @@ fn heads(field: &BTreeMap<String, TensorRole>) -> Vec<String> {
     field.iter().filter_map(head_name).collect()
 }
 
-/// Tensors of a deformation field, among which layers are found by name.
-struct FieldWeights<'a> {
-    tensors: &'a Tensors,
-}
-
 /// Linear layer of a network: weights `[outputs, inputs]` and a bias.
 #[derive(Clone)]
 struct WeightLayer<'a> {
@@ -142,25 +136,23 @@ struct WeightLayer<'a> {
     bias: &'a Tensor,
 }
 
-impl<'a> FieldWeights<'a> {
-    /// Returns the linear layer called `name`; `None` if it is missing or malformed.
-    fn layer(&self, name: String) -> Option<WeightLayer<'a>> {
-        let weight = self.tensors.get(&format!("{name}.weight")).filter(|weight| weight.shape.len() == 2)?;
-        let bias = self.tensors.get(&format!("{name}.bias")).filter(|bias| bias.data.len() == weight.shape[0])?;
-        Some(WeightLayer { name, weight, bias })
-    }
+/// Returns the linear layer called `name` among `tensors`; `None` if it is missing or malformed.
+fn layer(tensors: &Tensors, name: String) -> Option<WeightLayer<'_>> {
+    let weight = tensors.get(&format!("{name}.weight")).filter(|weight| weight.shape.len() == 2)?;
+    let bias = tensors.get(&format!("{name}.bias")).filter(|bias| bias.data.len() == weight.shape[0])?;
+    Some(WeightLayer { name, weight, bias })
+}
 
-    /// Returns the layers of the network `name` that are numbered `first`, `first + by`, `first + 2 * by` and so on, up
-    /// to the first number that is missing. Returns `None` if layer `first` is missing.
-    fn layers(&self, name: &str, first: usize, by: usize) -> Option<Vec<WeightLayer<'a>>> {
-        let layers = (0..).map_while(|k| self.layer(format!("{name}.{}", first + k * by)));
-        Some(layers.collect::<Vec<_>>()).filter(|layers| !layers.is_empty())
-    }
+/// Returns the layers of the trunk (the layers that all heads share), which have the numbers 0, 2, 4 and so on; `None`
+/// if there are none.
+fn trunk_layers(tensors: &Tensors) -> Option<Vec<WeightLayer<'_>>> {
+    let layers = (0..).map_while(|k| layer(tensors, format!("deformation_net.feature_out.{}", 2 * k)));
+    Some(layers.collect::<Vec<_>>()).filter(|layers| !layers.is_empty())
+}
 
-    /// Returns the two layers of the head (output network) `name`; `None` if one is missing or malformed.
-    fn head(&self, name: &str) -> Option<[WeightLayer<'a>; 2]> {
-        Some([self.layer(format!("{name}.1"))?, self.layer(format!("{name}.3"))?])
-    }
+/// Returns the two layers of the head (output network) `name`; `None` if one is missing or malformed.
+fn head_layers<'a>(tensors: &'a Tensors, name: &str) -> Option<[WeightLayer<'a>; 2]> {
+    Some([layer(tensors, format!("{name}.1"))?, layer(tensors, format!("{name}.3"))?])
 }
 
 impl WeightLayer<'_> {

@@ -25,7 +25,9 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use cloud::interleave_zeros;
-pub use cloud::{ATTRIBUTES, CloudSteps, Column, FIRST_SH_ATTRIBUTE, attribute};
+pub use cloud::{
+    ATTRIBUTES, CloudSteps, Column, FIRST_SH_ATTRIBUTE, attribute, attribute_values, round_cloud, round_column,
+};
 pub use field::{FieldSteps, TensorRole, TensorSteps, round_tensor};
 pub use file::{ArchiveSize, HEADER_BYTES, MAGIC, VERSION};
 pub use importance::step_offsets;
@@ -36,7 +38,7 @@ use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, Gaussians};
 use field::{EvaluationPoints, TensorEntry};
-use file::{ArchiveHeader, Damage, Sections};
+use file::{ArchiveHeader, Sections, damage};
 
 /// Name of the tensor that holds the box of space that the feature planes cover.
 pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
@@ -157,10 +159,10 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
 /// Fails if the bytes are not an archive, are truncated or damaged, have another version, or declare more content than
 /// the file can hold or than `memory` allows. Declared sizes are checked before anything is allocated.
 pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveContent, ArchiveSize)> {
-    let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.in_file(path))?;
+    let head = ArchiveHeader::parse(path, bytes, bytes.len() as u64)?;
     head.check_memory(path, memory)?;
-    let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.in_file(path))?;
-    let table = table(&sections, bytes.len()).map_err(|damage| damage.in_file(path))?;
+    let (sections, parts) = file::read(path, &head, bytes)?;
+    let table = table(path, &sections, bytes.len())?;
     let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
     // While decoding, a coder keeps two values and one mean error size (12 bytes) for each Gaussian. While decoding a
     // tensor, a coder keeps one mean error size (4 bytes) for each place of the tensor.
@@ -168,7 +170,7 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
     let needed = head.bytes() + 4 * values + 4 * places + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
     let parts = if table.tensors.is_empty() { parts.without_field() } else { parts };
-    decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
+    Ok((decode_sections(path, sections, table)?, parts))
 }
 
 /// Checks the header of the archive at `path` before the other bytes of the file are read. `head` holds the first
@@ -178,15 +180,15 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
 /// Fails if `head` is not the header of an archive of this length, or if decoding the archive takes more memory than
 /// `memory`.
 pub fn check_header(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
-    ArchiveHeader::parse(head, whole).map_err(|damage| damage.in_file(path))?.check_memory(path, memory)
+    ArchiveHeader::parse(path, head, whole)?.check_memory(path, memory)
 }
 
-/// Parses the table of contents of an archive of `length` bytes. Fails if its numbers are inconsistent or too large for
+/// Parses the table of contents of the archive at `path`, which has `length` bytes. Fails if its numbers are inconsistent or too large for
 /// a file of this length.
-fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damage> {
+fn table(path: &Path, sections: &Sections, length: usize) -> Result<Table> {
     let table: Table = serde_json::from_slice(&sections.table)
-        .map_err(|error| Damage::new("table", "a table of this version", error.to_string()))?;
-    let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
+        .map_err(|error| damage(path, "table", "a table of this version", error.to_string()))?;
+    let unsound = |place: &str| damage(path, place, "consistent numbers", "inconsistent ones");
     if !table.cloud.is_sound() {
         return Err(unsound("table of the Gaussians"));
     }
@@ -197,20 +199,15 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
         .tensors
         .iter()
         .try_fold(table.cloud.values(), |sum, entry| Some(sum.and_then(|sum| sum.checked_add(entry.values()?))));
-    file::check_size(values.flatten().and_then(|values| values.checked_mul(4)), length as u64)?;
+    file::check_size(path, values.flatten().and_then(|values| values.checked_mul(4)), length as u64)?;
     Ok(table)
 }
 
-/// Decodes the archive sections `sections`, whose table of contents `table` has been checked. Returns the content of
-/// the archive, and `parts` (the size of the archive by purpose) unchanged. Fails if the sections do not match the
-/// table.
-fn decoded(
-    sections: Sections,
-    table: Table,
-    parts: ArchiveSize,
-) -> std::result::Result<(ArchiveContent, ArchiveSize), Damage> {
+/// Decodes the sections `sections` of the archive at `path`, whose table of contents `table` has been checked. Returns
+/// the content of the archive. Fails if the sections do not match the table.
+fn decode_sections(path: &Path, sections: Sections, table: Table) -> Result<ArchiveContent> {
     let Sections { cloud, field, blobs, .. } = sections;
-    let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
+    let unsound = |place: &str| damage(path, place, "consistent numbers", "inconsistent ones");
     let (cloud, columns) = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("Gaussians"))?;
 
     let count = |entry: &&TensorEntry| entry.role == TensorRole::Exact;
@@ -253,30 +250,13 @@ fn decoded(
     content.tensors = field::decode(&table.tensors, &field, &exact, &points).ok_or_else(|| unsound("field"))?;
     content.field = table.tensors.into_iter().map(|entry| (entry.name, entry.role)).collect();
     (content.cloud, content.columns) = (cloud, columns);
-    Ok((content, parts))
+    Ok(content)
 }
 
 /// Returns the box of space that the feature planes of the deformation field cover; `None` if there are no feature
 /// planes.
 pub fn field_box(content: &ArchiveContent) -> Option<Box3> {
     content.tensors.get(BOX_TENSOR).and_then(|tensor| Box3::new(&tensor.data))
-}
-
-/// Rounds attributes of the Gaussians `cloud` in place to the quantization grids of `steps`, as an archive would, but
-/// keeps the order of the Gaussians. `attributes` lists the attributes to round, as indices in [`ATTRIBUTES`].
-pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
-    cloud::round(cloud, steps, attributes);
-}
-
-/// Rounds the values of `column` to the quantization grid with the step 2^(`step`/8), as an archive would.
-pub fn round_column(column: &mut Column, step: i32) {
-    cloud::round_all(column.values.planes_mut(), step);
-}
-
-/// Returns the values of the attribute [`ATTRIBUTES`]`[k]` of the Gaussians `cloud`: the first scalar component of all
-/// Gaussians, then the second, and so on.
-pub fn attribute_values(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
-    cloud::values(cloud, k)
 }
 
 /// Checks that every value that will be quantized is finite and that every quantization step is within

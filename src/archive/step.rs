@@ -38,10 +38,9 @@ pub fn step_size(k: i32) -> f64 {
     EIGHTHS[k.rem_euclid(8) as usize] * f64::from_bits(((1023 + whole) as u64) << 52)
 }
 
-/// Returns the number `k` in [`STEP_NUMBERS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size`
-/// must be positive.
-pub fn nearest_step_number(size: f64) -> i32 {
-    ((8.0 * size.log2()).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
+/// Returns the number `k` in [`STEP_NUMBERS`] whose step 2^(k/8) is closest to 2^`octave` on a logarithmic scale.
+pub fn nearest_step_number(octave: f64) -> i32 {
+    ((8.0 * octave).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }
 
 /// Number of possible values of [`PredictedMultiple::offset`], which says where between two quantized values a
@@ -135,7 +134,7 @@ mod tests {
         for k in STEP_NUMBERS {
             let expected = (f64::from(k) / 8.0).exp2();
             assert!((step_size(k) / expected - 1.0).abs() < 1e-14, "{k}: {} of {expected}", step_size(k));
-            assert_eq!(nearest_step_number(step_size(k)), k);
+            assert_eq!(nearest_step_number(step_size(k).log2()), k);
         }
     }
 

@@ -225,11 +225,12 @@ fn impossible_lengths_are_refused_before_allocation() {
         assert!(decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).is_err());
     }
     // A consistent table of contents that declares too many Gaussians.
+    let path = Path::new("a.gsz");
     let (Sections { table, cloud, field, blobs }, _) =
-        file::read(&ArchiveHeader::parse(&sound, sound.len() as u64).unwrap(), &sound).unwrap();
+        file::read(path, &ArchiveHeader::parse(path, &sound, sound.len() as u64).unwrap(), &sound).unwrap();
     let table = String::from_utf8(table).unwrap().replace("\"gaussians\":12", "\"gaussians\":4000000000");
     let bytes = file::write(&Sections { table: table.into_bytes(), cloud, field, blobs }).unwrap().0;
-    let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
+    let message = decode(&bytes, path, ReadLimit::NONE).unwrap_err().to_string();
     assert!(message.contains("bytes of content"), "{message}");
 }
 

@@ -122,11 +122,12 @@ pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], re
     Ok(())
 }
 
-/// Output file that is first written under a hidden name. [`StagedFile::commit`] moves it to the output path, or copies
-/// it into the device or FIFO at this path.
+/// Output file, possibly with companion files beside it, all first written under hidden names. [`StagedFile::commit`]
+/// moves all of them to their output paths together, or copies the file into the device or FIFO at its path.
 #[derive(Debug)]
 pub struct StagedFile {
     target: PathBuf,
+    companions: Vec<PathBuf>,
     content: PathBuf,
     replace: Replace,
     is_stream: bool,
@@ -141,43 +142,9 @@ impl StagedFile {
     /// Fails if the target has no name, if it exists and `replace` does not allow replacing it, or if a system call
     /// fails.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFile> {
-        let is_stream = destination(target)? == Destination::Stream;
-        let workspace = match is_stream {
-            // Write in the system's folder for temporary files, because no folder can be created beside a device.
-            true => scratch_workspace(&std::env::temp_dir())?,
-            false => output_workspace(target, TargetKind::File, replace)?,
-        };
-        Ok(StagedFile { target: target.to_owned(), content: workspace.content(), replace, is_stream, workspace })
+        StagedFile::with_companions(target, Vec::new(), replace)
     }
 
-    /// Returns the hidden path to which the caller writes the file before [`StagedFile::commit`].
-    pub fn path(&self) -> &Path {
-        &self.content
-    }
-
-    /// Syncs the file to disk and gives it its final name, replacing an existing file if `replace` allows it.
-    ///
-    /// # Errors
-    /// Fails if nothing was written, if a file that may not be replaced appeared meanwhile, or if a system call fails.
-    /// The target is then unchanged.
-    pub fn commit(self) -> Result<()> {
-        if self.is_stream {
-            return stream::copy(&self.content, &self.target);
-        }
-        sync(&self.content)?;
-        publish::publish_files(&self.workspace, &[(workspace::CONTENT.to_owned(), &self.target)], self.replace)
-    }
-}
-
-/// Output file with companion files beside it, all first written under hidden names. [`StagedFiles::commit`] moves all
-/// of them to their output paths together.
-#[derive(Debug)]
-pub struct StagedFiles {
-    file: StagedFile,
-    companions: Vec<PathBuf>,
-}
-
-impl StagedFiles {
     /// Prepares to write the output file `target` and the files `companions` beside it. All of them must have passed
     /// [`check_targets`]. The name of each companion must begin with the name of `target`. The first companion is the
     /// summary (JSON file that describes the result). `replace` says which existing files may be replaced. Returns the
@@ -185,50 +152,60 @@ impl StagedFiles {
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
-    pub fn new(target: &Path, companions: Vec<PathBuf>, replace: Replace) -> Result<StagedFiles> {
-        let file = StagedFile::new(target, replace)?;
+    pub fn with_companions(target: &Path, companions: Vec<PathBuf>, replace: Replace) -> Result<StagedFile> {
+        let is_stream = companions.is_empty() && destination(target)? == Destination::Stream;
+        let workspace = match is_stream {
+            // Write in the system's folder for temporary files, because no folder can be created beside a device.
+            true => scratch_workspace(&std::env::temp_dir())?,
+            false => output_workspace(target, TargetKind::File, replace)?,
+        };
         for companion in &companions {
             check_replace(companion, TargetKind::File, replace)?;
         }
-        Ok(StagedFiles { file, companions })
+        let (target, content) = (target.to_owned(), workspace.content());
+        Ok(StagedFile { target, companions, content, replace, is_stream, workspace })
     }
 
-    /// Returns the hidden path to which the caller writes the output file before [`StagedFiles::commit`].
+    /// Returns the hidden path to which the caller writes the output file before [`StagedFile::commit`].
     pub fn path(&self) -> &Path {
-        self.file.path()
+        &self.content
     }
 
     /// Returns the hidden path to which the caller writes the companion file with index `index`.
     pub fn companion_path(&self, index: usize) -> PathBuf {
-        self.file.workspace.folder.join(companion_name(index))
+        self.workspace.folder.join(companion_name(index))
     }
 
     /// Publishes the output file and its companions: adds the list of all these files to the summary (the first
     /// companion), syncs the files to disk and renames them to their final names. The summary is renamed first and the
-    /// output file last, so that at every moment a summary says to which result a published file belongs.
+    /// output file last, so that at every moment a summary says to which result a published file belongs. Replaces
+    /// existing files if the policy allows it.
     ///
     /// Runs with the same output publish one after the other, so files of different runs are never mixed. If the
     /// process is killed between two renames, the next run with this output completes the set.
     ///
     /// # Errors
-    /// Fails if the summary is not a JSON object, and like [`StagedFile::commit`] for each file.
+    /// Fails if nothing was written, if the summary is not a JSON object, if a file that may not be replaced appeared
+    /// meanwhile, or if a system call fails.
     pub fn commit(self) -> Result<()> {
-        let StagedFiles { file, companions } = &self;
-        let names = companions.iter().chain([&file.target]);
+        if self.is_stream {
+            return stream::copy(&self.content, &self.target);
+        }
+        let names = self.companions.iter().chain([&self.target]);
         let names = names.map(|path| Ok(split_target(path)?.1.to_string_lossy().into_owned()));
         let mut names = names.collect::<Result<Vec<String>>>()?;
         names.sort();
-        if !companions.is_empty() {
+        if !self.companions.is_empty() {
             add_file_list(&self.companion_path(0), &names)?;
         }
         let mut files: Vec<(String, &Path)> = Vec::new();
-        for (index, target) in companions.iter().enumerate() {
+        for (index, target) in self.companions.iter().enumerate() {
             sync(&self.companion_path(index))?;
             files.push((companion_name(index), target));
         }
-        sync(file.path())?;
-        files.push((workspace::CONTENT.to_owned(), &file.target));
-        publish::publish_files(&file.workspace, &files, file.replace)
+        sync(&self.content)?;
+        files.push((workspace::CONTENT.to_owned(), &self.target));
+        publish::publish_files(&self.workspace, &files, self.replace)
     }
 }
 

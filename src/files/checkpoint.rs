@@ -11,18 +11,20 @@
 
 pub(crate) mod write;
 
-use std::io::{Read, Seek, SeekFrom};
+use std::fs::File;
+use std::io::{BufReader, Read};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use flate2::Crc;
 use half::{bf16, f16};
 use hashbrown::HashMap;
 use zip::{CompressionMethod, ZipArchive};
 
+use super::open::open_file;
 use super::pickle::PickleError;
 pub(crate) use super::pickle::{MAX_DEPTH, Node, NodeId, Pickle};
-use super::shared_file::SharedFile;
 use super::zip_directory::{checksum_matches, declared_directory};
 use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
@@ -40,18 +42,35 @@ const ENTRY_BYTES: u64 = 640;
 /// small file can declare a huge tensor.
 const MAX_EXPANSION: usize = 4;
 
+/// Size in bytes of the buffer through which the zip archive is read. It is small, because only the headers of files
+/// are read in small parts.
+const BUFFER_BYTES: usize = 512;
+
+/// Zip archive of a checkpoint. The file is not memory-mapped, so bytes that were read do not count as memory of the
+/// process.
+type Archive = ZipArchive<BufReader<File>>;
+
 /// PyTorch checkpoint that is open for reading.
 #[derive(Debug)]
 pub(crate) struct Checkpoint {
     path: PathBuf,
     memory: ReadLimit,
-    file: SharedFile,
-    archive: ZipArchive<SharedFile>,
+    /// Zip archive of the file, locked while a file in it is read.
+    archive: Mutex<Archive>,
     pickle: Pickle,
     /// Index of the pickle file among the files of the archive.
     pickle_index: usize,
-    /// Storages (blocks of tensor values) by key: index of the file in the archive, and size in bytes.
-    storages: HashMap<String, (usize, usize)>,
+    /// Storages (blocks of tensor values) by key.
+    storages: HashMap<String, Storage>,
+}
+
+/// Storage (block of tensor values) of a checkpoint.
+#[derive(Debug)]
+struct Storage {
+    /// Index of the storage among the files of the archive.
+    index: usize,
+    /// Byte range of the values in the checkpoint file.
+    range: Range<usize>,
 }
 
 /// Type of the values of a tensor.
@@ -208,25 +227,26 @@ impl Checkpoint {
     /// Fails if the file is not a zip archive of uncompressed entries or is cut short, if its pickle cannot be read, or
     /// if it needs more memory than allowed.
     pub(crate) fn open(path: &Path, memory: ReadLimit) -> Result<Checkpoint> {
-        let file = SharedFile::open(path)?;
+        let mut file = open_file(path)?;
+        let length = file.metadata().map_err(Error::io("read the size of", path))?.len();
         let wrong = |place: &str, found: String| {
             Error::input(path, place, "a checkpoint as torch.save writes it", found)
                 .hint("if the file was copied, copy it again; otherwise load it and save it again with torch.save")
         };
         let mut head = Vec::new();
-        file.clone().take(64).read_to_end(&mut head).map_err(Error::io("read", path))?;
+        (&mut file).take(64).read_to_end(&mut head).map_err(Error::io("read", path))?;
         if has_legacy_magic(&head) {
             return Err(legacy_format(path));
         }
         let broken = |error: zip::result::ZipError| wrong(LIST, error.to_string());
-        let directory = declared_directory(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
+        let directory = declared_directory(&mut file).map_err(|error| wrong(LIST, error.to_string()))?;
         if directory.entries > MAX_ENTRIES {
             return Err(wrong(LIST, format!("{} files", directory.entries)));
         }
-        let listed = 3 * directory.bytes.min(file.len()) + ENTRY_BYTES * directory.entries;
+        let listed = 3 * directory.bytes.min(length) + ENTRY_BYTES * directory.entries;
         memory.check(path, LIST, &format!("the names of {} files", directory.entries), listed)?;
-        let mut archive = ZipArchive::new(file.clone()).map_err(broken)?;
-        let (mut storages, mut pickle_index) = (HashMap::new(), None);
+        let mut archive = ZipArchive::new(BufReader::with_capacity(BUFFER_BYTES, file)).map_err(broken)?;
+        let (mut storages, mut pickle_index, mut byte_order) = (HashMap::new(), None, None);
         for index in 0..archive.len() {
             let entry = archive.by_index(index).map_err(broken)?;
             let at = |found: &str| wrong(&format!("file {}", quoted(entry.name())), found.to_owned());
@@ -239,7 +259,7 @@ impl Checkpoint {
                 )
                 .hint("load the checkpoint with torch.load and save it again with torch.save"));
             }
-            if entry.data_start().checked_add(entry.size()).is_none_or(|end| end > file.len()) {
+            if entry.data_start().checked_add(entry.size()).is_none_or(|end| end > length) {
                 return Err(at("cut short"));
             }
             match without_first_folder(entry.name()) {
@@ -254,21 +274,23 @@ impl Checkpoint {
                 }
                 PICKLE if pickle_index.is_some() => return Err(at("a second pickle")),
                 PICKLE => pickle_index = Some((index, entry.size())),
-                "byteorder" if is_big_endian_marker(&file, entry.data_start()) => {
-                    return Err(wrong("byteorder", "big-endian values".into()));
-                }
+                "byteorder" => byte_order = Some(index),
                 other => {
                     if let Some(key) = other.strip_prefix("data/") {
-                        storages.insert(key.to_owned(), (index, entry.size() as usize));
+                        let start = entry.data_start() as usize;
+                        storages.insert(key.to_owned(), Storage { index, range: start..start + entry.size() as usize });
                     }
                 }
             }
+        }
+        if byte_order.is_some_and(|index| is_big_endian_marker(&mut archive, index)) {
+            return Err(wrong("byteorder", "big-endian values".into()));
         }
         let (pickle_index, bytes) = pickle_index.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
         memory.check(path, PICKLE, "the list of files and the pickle", listed + bytes)?;
         // Leave an eighth of the memory to the allocator, which cannot always reuse freed memory for new requests.
         let left = (memory.bytes() - listed - bytes) / 8 * 7;
-        let bytes = read_entry(&mut archive, &file, pickle_index).map_err(|error| wrong(PICKLE, error.to_string()))?;
+        let bytes = read_entry(&mut archive, pickle_index).map_err(|error| wrong(PICKLE, error.to_string()))?;
         let pickle = Pickle::read(&bytes, left).map_err(|error| match error {
             PickleError::Malformed(at, found) => wrong(&format!("{PICKLE}, byte {at}"), found),
             PickleError::TooMuch(at, expected, found) => {
@@ -284,7 +306,8 @@ impl Checkpoint {
                 })
             }
         })?;
-        Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_index, storages })
+        let archive = Mutex::new(archive);
+        Ok(Checkpoint { path: path.to_owned(), memory, archive, pickle, pickle_index, storages })
     }
 
     /// Checks that `bytes` bytes of memory may be used for reading `what`, which is at `place` in the file. Fails if
@@ -352,9 +375,17 @@ impl Checkpoint {
     /// Returns the bytes of the file that hold the storage (block of tensor values) `key`; `None` if there is no such
     /// storage.
     pub(crate) fn storage_range(&self, key: &str) -> Option<Range<usize>> {
-        let &(index, bytes) = self.storages.get(key)?;
-        let start = usize::try_from(self.archive.clone().by_index(index).ok()?.data_start()).ok()?;
-        Some(start..start.checked_add(bytes)?)
+        self.storages.get(key).map(|storage| storage.range.clone())
+    }
+
+    /// Locks and returns the zip archive.
+    fn archive(&self) -> MutexGuard<'_, Archive> {
+        self.archive.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns the number of values of the type `kind` that the storage `key` holds; 0 if there is no such storage.
+    fn stored_values(&self, key: &str, kind: ValueType) -> usize {
+        self.storages.get(key).map_or(0, |storage| storage.range.len() / kind.bytes())
     }
 
     /// Returns the non-negative integer at node `id` and its byte range in the pickle; `None` for other nodes.
@@ -386,8 +417,8 @@ impl Checkpoint {
     /// Checks that the storage of `tensor` holds all of its elements, and that the tensor has at most 4
     /// ([`MAX_EXPANSION`]) elements per stored value. The error describes the tensor and its storage.
     pub(crate) fn check(&self, tensor: &TensorView) -> std::result::Result<(), String> {
-        let values = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes / tensor.kind.bytes());
         self.check_extent(tensor)?;
+        let values = self.stored_values(&tensor.storage, tensor.kind);
         match tensor.len().is_some_and(|len| len <= values.saturating_mul(MAX_EXPANSION)) {
             true => Ok(()),
             false => Err(format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage)),
@@ -396,10 +427,10 @@ impl Checkpoint {
 
     /// Checks that the storage of `tensor` holds all of its elements. The error describes the tensor and its storage.
     pub(crate) fn check_extent(&self, tensor: &TensorView) -> std::result::Result<(), String> {
-        let Some(&(_, bytes)) = self.storages.get(&tensor.storage) else {
+        if !self.storages.contains_key(&tensor.storage) {
             return Err(format!("no file data/{}", tensor.storage));
-        };
-        let values = bytes / tensor.kind.bytes();
+        }
+        let values = self.stored_values(&tensor.storage, tensor.kind);
         let too_short = || format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage);
         let len = tensor.len().ok_or_else(too_short)?;
         let last = tensor.shape.iter().zip(&tensor.stride).try_fold(tensor.offset, |last, (&length, &stride)| {
@@ -414,7 +445,7 @@ impl Checkpoint {
     /// Returns the maximum number of elements, of type `kind`, that all tensors in the storage `key` may have together:
     /// 4 ([`MAX_EXPANSION`]) times the number of stored values; 0 if the storage is missing.
     pub(crate) fn max_values(&self, key: &str, kind: ValueType) -> usize {
-        self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
+        self.stored_values(key, kind).saturating_mul(MAX_EXPANSION)
     }
 
     /// Reads the bytes of the storage (block of tensor values) `key`.
@@ -427,9 +458,9 @@ impl Checkpoint {
             self.wrong(&place, "the values as they were written", found)
                 .hint("the file is damaged or cut short: copy it again")
         };
-        let &(index, bytes) = self.storages.get(key).ok_or_else(|| wrong("no such file".into()))?;
-        self.allow(&place, "its values", bytes as u64)?;
-        read_entry(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
+        let storage = self.storages.get(key).ok_or_else(|| wrong("no such file".into()))?;
+        self.allow(&place, "its values", storage.range.len() as u64)?;
+        read_entry(&mut self.archive(), storage.index).map_err(|error| wrong(error.to_string()))
     }
 
     /// Reads the elements of a floating-point tensor as f32, the last axis fastest; `place` names it in messages.
@@ -438,7 +469,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if values are damaged or need more memory than allowed.
     pub(crate) fn values(&self, tensor: &TensorView, place: &str) -> Result<Vec<f32>> {
-        let stored = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes as u64);
+        let stored = self.storages.get(&tensor.storage).map_or(0, |storage| storage.range.len() as u64);
         let (bytes, len) = (tensor.kind.bytes(), tensor.len().unwrap_or(0));
         self.allow(place, "its values", stored.saturating_add(4 * len as u64))?;
         let stored = self.storage(&tensor.storage)?;
@@ -453,13 +484,13 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a file is damaged or `take` fails.
     pub(crate) fn files(&self, mut take: impl FnMut(&str, CheckpointFile<'_>, Vec<u8>) -> Result<()>) -> Result<()> {
-        let mut archive = self.archive.clone();
-        for index in 0..archive.len() {
+        let count = self.archive().len();
+        for index in 0..count {
             let broken = |error: &dyn std::fmt::Display| {
                 self.wrong(&format!("file {index}"), "its bytes as they were written", error.to_string())
             };
-            let name = archive.by_index(index).map_err(|error| broken(&error))?.name().to_owned();
-            let bytes = read_entry(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
+            let name = self.archive().by_index(index).map_err(|error| broken(&error))?.name().to_owned();
+            let bytes = read_entry(&mut self.archive(), index).map_err(|error| broken(&error))?;
             let what = match without_first_folder(&name).strip_prefix("data/") {
                 _ if index == self.pickle_index => CheckpointFile::Pickle,
                 Some(key) => CheckpointFile::Storage(key),
@@ -514,29 +545,22 @@ pub(crate) fn legacy_format(path: &Path) -> Error {
 /// Name that error messages use for the list of files of the zip archive, if the error is in this list.
 const LIST: &str = "list of files";
 
-/// Returns whether the text "big" is at byte `at` of the file. PyTorch stores it if the values are big-endian.
-fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
-    let (mut file, mut text) = (file.clone(), [0; 3]);
-    file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
+/// Returns whether the file with index `index` in `archive` begins with the text "big". PyTorch stores it if the values
+/// are big-endian.
+fn is_big_endian_marker(archive: &mut Archive, index: usize) -> bool {
+    let mut text = Vec::new();
+    archive.by_index_raw(index).is_ok_and(|entry| entry.take(3).read_to_end(&mut text).is_ok()) && text == b"big"
 }
 
-/// Reads the bytes of the file with index `index` in the zip archive `archive`, which `file` holds. The file in the
-/// archive must be uncompressed. Fails if its bytes do not match its checksum.
-fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
-    let (start, size, expected) = {
-        let entry = archive.by_index(index)?;
-        (entry.data_start(), entry.size(), entry.crc32())
-    };
-    let mut file = file.clone();
-    if size > file.len() {
-        return Err(std::io::Error::other(format!("{size} bytes of a file of {}", file.len())));
-    }
-    let mut bytes = vec![0; size as usize];
-    file.seek(SeekFrom::Start(start))?;
-    file.read_exact(&mut bytes)?;
+/// Reads the bytes of the file with index `index` in the zip archive `archive`. The file in the archive must be
+/// uncompressed. Fails if its bytes do not match its checksum.
+fn read_entry(archive: &mut Archive, index: usize) -> std::io::Result<Vec<u8>> {
+    let mut entry = archive.by_index_raw(index)?;
+    let mut bytes = vec![0; entry.size() as usize];
+    entry.read_exact(&mut bytes)?;
     let mut sum = Crc::new();
     sum.update(&bytes);
-    match checksum_matches(expected, sum.sum()) {
+    match checksum_matches(entry.crc32(), sum.sum()) {
         true => Ok(bytes),
         false => Err(std::io::Error::other("bytes that do not match their checksum")),
     }

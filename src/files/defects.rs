@@ -9,6 +9,12 @@ pub const INFINITE_LOGIT_REPAIR: &str = "read as ±100, which is opaque or invis
 /// first above this fraction, otherwise last.
 const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
+/// Kind of defect of a row (Gaussian). The elements are its name, whether rows with it are left out, and the reason.
+pub type Defect = (&'static str, bool, &'static str);
+
+/// Zero quaternion of a row (Gaussian) that the user asks to keep.
+pub const KEPT_ZERO_QUATERNION: Defect = ("zero quaternion", false, "taken as the identity, as --zero-rotation asks");
+
 /// Counts of the rows of a file that have defects, and of the rows that the reader dropped because of defects.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Defects {
@@ -43,11 +49,11 @@ impl Defects {
         Defects { rows, ..Defects::default() }
     }
 
-    /// Counts the defects `row_defects` in row `row`. Each defect is given by its name, whether the row is dropped
-    /// because of it, and the reason.
-    pub fn add_row(&mut self, row: u32, row_defects: &[(&str, bool, &str)]) {
+    /// Counts the defects `row_defects` in row `row`. Returns whether the row is dropped because of them.
+    pub fn add_row(&mut self, row: u32, row_defects: &[Defect]) -> bool {
         self.defective += usize::from(!row_defects.is_empty());
-        self.dropped += usize::from(row_defects.iter().any(|&(_, dropped, _)| dropped));
+        let is_dropped = row_defects.iter().any(|&(_, dropped, _)| dropped);
+        self.dropped += usize::from(is_dropped);
         for &(what, dropped, why) in row_defects {
             let place = self.kinds.iter().position(|kind| kind.what == what).unwrap_or_else(|| {
                 let (what, why) = (what.to_owned(), why.to_owned());
@@ -60,11 +66,18 @@ impl Defects {
                 kind.first.push(row);
             }
         }
+        is_dropped
     }
 
     /// Returns whether no row with a defect has been counted.
     pub fn is_empty(&self) -> bool {
         self.defective == 0
+    }
+
+    /// Returns the names of the defects found with their numbers of rows, for messages: "zero quaternion in 3".
+    pub fn describe_kinds(&self) -> String {
+        let kinds: Vec<String> = self.kinds.iter().map(|kind| format!("{} in {}", kind.what, kind.rows)).collect();
+        kinds.join(", ")
     }
 
     /// Returns the notes for the user: one per kind of defect, and one with the total counts of rows that were dropped
@@ -119,7 +132,7 @@ mod tests {
         let (nan, wide) = (("NaN", true, "not drawn"), ("wide", false, "always visible"));
         defects.add_row(3, &[nan, wide]);
         defects.add_row(4, &[]);
-        (10..20).for_each(|row| defects.add_row(row, &[wide]));
+        (10..20).for_each(|row| assert!(!defects.add_row(row, &[wide])));
         assert_eq!((defects.defective, defects.dropped), (11, 1));
         let counts: Vec<(&str, usize)> = defects.kinds.iter().map(|kind| (&*kind.what, kind.rows)).collect();
         assert_eq!(counts, [("NaN", 1), ("wide", 11)]);
@@ -131,7 +144,7 @@ mod tests {
                 "11 of 1000 rows have defects: 1 (0.10%) left out, 10 repaired",
             ]
         );
-        (20..40).for_each(|row| defects.add_row(row, &[nan]));
+        (20..40).for_each(|row| assert!(defects.add_row(row, &[nan])));
         assert!(defects.notes()[0].starts_with("31 of 1000 rows have defects: 21 (2.10%) left out"));
         assert_eq!(Defects::new(7).notes(), [""; 0]);
     }

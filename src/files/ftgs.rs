@@ -12,7 +12,7 @@
 use std::path::Path;
 
 use crate::error::{Error, Result, quoted};
-use crate::files::defects::Defects;
+use crate::files::defects::{Defect, Defects, KEPT_ZERO_QUATERNION};
 use crate::files::ply::write::write_inria_with;
 use crate::files::ply::{Ply, PlyOptions};
 use crate::files::splatv::rows::ZeroRotation;
@@ -110,20 +110,14 @@ pub struct FtgsFile {
     pub defects: Defects,
 }
 
-/// Defect of a row (Gaussian) with a value that is not finite. The elements are the name of the defect, whether rows
-/// with it are left out, and the reason.
-const NON_FINITE: (&str, bool, &str) = ("NaN or infinite value", true, "the player refuses files with such values");
-/// Defect of a row (Gaussian) with a zero quaternion, if the user does not ask to keep such rows: name, whether rows
-/// with it are left out, and the reason.
-const ZERO_QUATERNION: (&str, bool, &str) = (
+/// Value of a row (Gaussian) that is not finite.
+const NON_FINITE: Defect = ("NaN or infinite value", true, "the player refuses files with such values");
+/// Zero quaternion of a row (Gaussian), if the user does not ask to keep such rows.
+const ZERO_QUATERNION: Defect = (
     "zero quaternion",
     true,
     "the player refuses files with such rotations; --zero-rotation identity keeps the Gaussians without a rotation",
 );
-/// Defect of a row (Gaussian) with a zero quaternion, if the user asks to keep such rows: name, whether rows with it
-/// are left out, and the reason.
-const KEPT_ZERO_QUATERNION: (&str, bool, &str) =
-    ("zero quaternion", false, "taken as the identity, as --zero-rotation asks");
 
 impl FtgsHeader {
     /// Parses the settings in `comments`, the comment lines in the header of the PLY file at `path`. `sh_degree` is the
@@ -197,9 +191,8 @@ impl FtgsFile {
         let mut params = StoredParams { gaussians: ply.whole()?, format_specific: own };
         let (defects, kept) = inspect(&params, zero_rotation);
         if defects.dropped > 0 && kept.is_empty() {
-            let kinds: Vec<String> =
-                defects.kinds.iter().map(|kind| format!("{} in {}", kind.what, kind.rows)).collect();
-            return Err(Error::input(path, "element vertex", "Gaussians that the player shows", kinds.join(", "))
+            let found = defects.describe_kinds();
+            return Err(Error::input(path, "element vertex", "Gaussians that the player shows", found)
                 .hint("the model did not train, or its conversion failed: export it again"));
         }
         if defects.dropped > 0 {
@@ -233,8 +226,7 @@ fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<
         let found =
             [(!columns.iter().all(is_finite), NON_FINITE), (params.gaussians.rotation.row::<4>(row) == [0.0; 4], zero)];
         let found: Vec<_> = found.into_iter().filter_map(|(is_there, defect)| is_there.then_some(defect)).collect();
-        defects.add_row(row as u32, &found);
-        if !found.iter().any(|&(_, dropped, _)| dropped) {
+        if !defects.add_row(row as u32, &found) {
             kept.push(row as u32);
         }
     }

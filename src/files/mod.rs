@@ -28,7 +28,6 @@ pub mod ply;
 pub mod ply_frames;
 pub mod ply_sequence;
 pub(crate) mod python_literal;
-mod shared_file;
 pub mod sog;
 pub mod splat;
 pub mod splatv;

@@ -221,8 +221,8 @@ impl Pickle {
     }
 }
 
-/// Encodes the pickle instruction that pushes the integer `value`.
-fn int(value: u64) -> Vec<u8> {
+/// Encodes the pickle instruction that pushes the integer `value`, in the shortest form.
+pub(crate) fn int(value: u64) -> Vec<u8> {
     match value {
         0..=0xff => vec![b'K', value as u8],
         0x100..=0xffff => [&[b'M'][..], &(value as u16).to_le_bytes()].concat(),

@@ -8,6 +8,8 @@ use crate::error::{Error, quoted};
 
 /// Maximum nesting depth of a literal. The parser recurses, so each level takes space on the call stack.
 const MAX_DEPTH: usize = 32;
+/// Escape sequences of a backslash and one character, each with the character that it stands for.
+const ESCAPES: [(char, char); 6] = [('n', '\n'), ('t', '\t'), ('r', '\r'), ('\\', '\\'), ('\'', '\''), ('"', '"')];
 
 /// Parsed Python literal, or text that is no literal.
 #[derive(Debug, Clone, PartialEq)]
@@ -256,43 +258,29 @@ impl<'a> Parser<'a> {
                 continue;
             }
             let bad = ParseError { byte: open + i, expected: "a Python escape sequence" };
-            let digits = match chars.next() {
-                None => return Err(unterminated),
-                Some((_, 'n')) => {
-                    value.push('\n');
-                    0
-                }
-                Some((_, 't')) => {
-                    value.push('\t');
-                    0
-                }
-                Some((_, 'r')) => {
-                    value.push('\r');
-                    0
-                }
-                Some((_, 'x')) => 2,
-                Some((_, 'u')) => 4,
-                Some((_, 'U')) => 8,
-                Some((_, c @ ('\\' | '\'' | '"'))) => {
-                    value.push(c);
-                    0
-                }
+            let Some((_, letter)) = chars.next() else { return Err(unterminated) };
+            if let Some((_, meaning)) = ESCAPES.iter().find(|(known, _)| *known == letter) {
+                value.push(*meaning);
+                continue;
+            }
+            let digits = match letter {
+                'x' => 2,
+                'u' => 4,
+                'U' => 8,
                 // Keep unknown escape sequences unchanged, as Python does.
-                Some((_, c)) => {
-                    value.extend(['\\', c]);
-                    0
+                _ => {
+                    value.extend(['\\', letter]);
+                    continue;
                 }
             };
-            if digits > 0 {
-                let mut code = 0u32;
-                for _ in 0..digits {
-                    let digit = chars.next().and_then(|(_, c)| c.to_digit(16));
-                    let Some(digit) = digit else { return Err(bad) };
-                    code = code << 4 | digit;
-                }
-                // A lone surrogate, as Python writes for a path that is not UTF-8, cannot be a char.
-                value.push(char::from_u32(code).unwrap_or(char::REPLACEMENT_CHARACTER));
+            let mut code = 0u32;
+            for _ in 0..digits {
+                let digit = chars.next().and_then(|(_, c)| c.to_digit(16));
+                let Some(digit) = digit else { return Err(bad) };
+                code = code << 4 | digit;
             }
+            // A lone surrogate, as Python writes for a path that is not UTF-8, cannot be a char.
+            value.push(char::from_u32(code).unwrap_or(char::REPLACEMENT_CHARACTER));
         }
         Err(unterminated)
     }

@@ -30,18 +30,25 @@ pub fn serialize_path<S: Serializer>(path: &Path, serializer: S) -> std::result:
 /// Reads the text file at `path`, which may have at most `most_bytes` bytes, and removes a byte order mark.
 ///
 /// # Errors
-/// Fails like [`read_small`], and if the text is not UTF-8; the message then names the first invalid byte.
+/// Fails like [`read_small`] and [`decode_text`].
 pub fn read_text(path: &Path, most_bytes: u64) -> Result<String> {
-    let bytes = read_small(path, most_bytes, "a text")?;
-    let text = without_mark(path, &bytes)?;
-    utf_8(path, text, (bytes.len() - text.len()) as u64).map(str::to_owned)
+    decode_text(path, &read_small(path, most_bytes, "a text")?).map(str::to_owned)
+}
+
+/// Returns `bytes`, the content of the file at `path`, as text without a byte order mark.
+///
+/// # Errors
+/// Fails if the text is not UTF-8; the message then names the first invalid byte.
+pub(super) fn decode_text<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a str> {
+    let text = without_mark(path, bytes)?;
+    utf_8(path, text, (bytes.len() - text.len()) as u64)
 }
 
 /// Returns `bytes`, the first bytes of the file at `path`, without a UTF-8 byte order mark.
 ///
 /// # Errors
 /// Fails if `bytes` begin with a UTF-16 byte order mark.
-pub(super) fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
+fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
     if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = bytes {
         let found = "the byte order mark of UTF-16";
         return Err(Error::input(path, "byte 0", "text in UTF-8", found).hint("save it as UTF-8"));
@@ -49,17 +56,13 @@ pub(super) fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]>
     Ok(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
 }
 
-/// Returns the error for `byte`, at offset `place` of the file at `path`, which makes the text invalid in UTF-8.
-pub(super) fn not_utf_8(path: &Path, place: u64, byte: u8) -> Error {
-    Error::input(path, format!("byte {place}"), "text in UTF-8", format!("the byte 0x{byte:02x}"))
-        .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
-}
-
 /// Returns `bytes` as text. The bytes begin at offset `start` of the file at `path`. Fails if they are not UTF-8.
 fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     str::from_utf8(bytes).map_err(|error| {
         let at = error.valid_up_to();
-        not_utf_8(path, start + at as u64, bytes[at])
+        let place = format!("byte {}", start + at as u64);
+        Error::input(path, place, "text in UTF-8", format!("the byte 0x{:02x}", bytes[at]))
+            .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
     })
 }
 

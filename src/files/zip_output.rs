@@ -1,6 +1,43 @@
-//! Output for a zip writer that remembers a failed write and reports it once, when the output is closed.
+//! Writes zip archives whose bytes depend only on their content. A failed write is reported once, when the archive is
+//! complete.
 
-use std::io::{self, Seek, SeekFrom, Write};
+use std::fs::File;
+use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::path::Path;
+
+use zip::write::FileOptions;
+use zip::{CompressionMethod, DateTime, ZipWriter};
+
+use crate::error::{Error, Result};
+
+/// Zip archive that is written to a file.
+pub(crate) type ZipFileWriter = ZipWriter<ZipOutput<BufWriter<File>>>;
+
+/// Creates the zip archive `path` without files.
+///
+/// # Errors
+/// Fails if the file cannot be created.
+pub(crate) fn create_zip(path: &Path) -> Result<ZipFileWriter> {
+    let file = File::create(path).map_err(Error::io("create", path))?;
+    Ok(ZipWriter::new(ZipOutput::new(BufWriter::new(file))))
+}
+
+/// Completes the zip archive `path`.
+///
+/// # Errors
+/// Fails if this write or an earlier one failed.
+pub(crate) fn finish_zip(mut archive: ZipFileWriter, path: &Path) -> Result<()> {
+    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(Error::io("write", path))
+}
+
+/// Returns the options for a file of at most `bytes` bytes in a zip archive: uncompressed, and dated 1980-01-01, so that
+/// the archive does not depend on the time at which it is written.
+pub(crate) fn stored_file_options(bytes: u64) -> FileOptions {
+    FileOptions::default()
+        .compression_method(CompressionMethod::Stored)
+        .last_modified_time(DateTime::default())
+        .large_file(bytes > u64::from(u32::MAX))
+}
 
 /// Output for a zip writer that reports a failed write only in [`ZipOutput::close`], and accepts and discards all bytes
 /// after the failure. This is necessary because a zip writer that is dropped after an error writes its list of files

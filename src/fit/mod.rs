@@ -116,6 +116,17 @@ impl FitError {
         }
     }
 
+    /// Returns the errors as text for a note to the user.
+    pub fn error_note(&self) -> String {
+        format!(
+            "error of positions, as a fraction of the Gaussian's middle scale: {:.3} rms, {:.3} at most; error of \
+             opacities: {:.3} at most",
+            self.rms(),
+            self.max_position_error,
+            self.max_opacity_error
+        )
+    }
+
     /// Returns the root mean square distance between the positions of the fit and of the Gaussian, over all compared
     /// states. Distances are in units of the Gaussian's middle scale (the middle one of its three scales).
     pub fn rms(&self) -> f64 {

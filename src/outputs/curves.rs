@@ -5,13 +5,14 @@
 
 use std::path::Path;
 
+use super::fit_tracks;
 use crate::error::Result;
 use crate::files::accuracy::CodingErrors;
 use crate::files::splatv::SplatvGaussian;
 use crate::files::splatv::write::{add_errors, default_cameras, encode_words, write_splatv};
-use crate::fit::{CubicTrack, CurveForm, FitError, Tolerance, fit_curves};
+use crate::fit::{CubicTrack, CurveForm, Tolerance, fit_curves};
 use crate::model::{Attributes, color_from_sh};
-use crate::passes::{gather_all, map_tracks};
+use crate::passes::gather_all;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
@@ -22,32 +23,20 @@ use crate::source::FrameSource;
 /// Fails if a frame cannot be read or the file cannot be written.
 pub fn write_fitted_splatv(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
     let info = source.info();
-    let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
-    let times = scale_to_unit(&info.times);
     let tolerance = Tolerance::default();
-    let found = map_tracks(source, &times, &progress, |track| {
-        let mut misfit = FitError::default();
-        (fit_curves(track, CurveForm::CUBIC, &tolerance, &mut misfit), misfit)
+    let (found, misfit) = fit_tracks(source, &scale_to_unit(&info.times), events, |track, misfit| {
+        fit_curves(track, CurveForm::CUBIC, &tolerance, misfit)
     })?;
-    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(FitError::default(), FitError::merged_with);
-    let rows: Vec<SplatvGaussian> = found.iter().flat_map(|(curves, _)| curves).map(splatv_gaussian).collect();
+    let rows: Vec<SplatvGaussian> = found.iter().flatten().map(splatv_gaussian).collect();
     let first = gather_all(source, 0, Attributes::POSITION)?;
     let mut accuracy = CodingErrors::new(&first.position);
-    let row_ids = found.iter().enumerate().flat_map(|(id, (curves, _))| curves.iter().map(move |_| id));
+    let row_ids = found.iter().enumerate().flat_map(|(id, curves)| curves.iter().map(move |_| id));
     row_ids.zip(&rows).for_each(|(id, row)| add_errors(row, id, &mut accuracy));
     accuracy.check("a .splatv")?;
     let rows: Vec<_> = rows.iter().map(encode_words).collect();
     write_splatv(path, rows.len(), rows.iter().copied(), &default_cameras(&first.position))?;
     let sh_loss = if info.sh_degree > 0 { ", in colors that do not change with direction" } else { "" };
-    Ok(format!(
-        "{} Gaussians became {} curves{sh_loss}; error of positions, as a fraction of the Gaussian's middle scale: {:.3} \
-         rms, {:.3} at most; error of opacities: {:.3} at most",
-        info.count,
-        rows.len(),
-        misfit.rms(),
-        misfit.max_position_error,
-        misfit.max_opacity_error
-    ))
+    Ok(format!("{} Gaussians became {} curves{sh_loss}; {}", info.count, rows.len(), misfit.error_note()))
 }
 
 /// Returns `times` unchanged if all of them are in the range from 0 to 1. Otherwise scales them, so that the first

@@ -10,12 +10,12 @@ use std::path::Path;
 use fourdgs::quantization::{Bounds, SH_QUANT_HI, SH_QUANT_LO, Steps, life_class, motion_step, support_k};
 use fourdgs::{GaussianSet, SceneExtras, WriteOptions, write_to_vec};
 
+use super::fit_tracks;
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::{CodingErrors, RenderedAttributes, far_gaussians};
-use crate::fit::{FitError, LinearPiece, Tolerance, fit_lines};
+use crate::fit::{LinearPiece, Tolerance, fit_lines};
 use crate::model::{AttributeValues, color_from_sh};
-use crate::passes::map_tracks;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
@@ -29,29 +29,24 @@ const FRAME_RATE: f64 = 30.0;
 /// Fails if a frame cannot be read, if the format cannot hold a value, or if the file cannot be written.
 pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
     let info = source.info();
-    let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let tolerance = Tolerance::default();
     let starts: Vec<f64> = (0..=info.times.len()).map(|frame| frame as f64 / FRAME_RATE).collect();
-    let found = map_tracks(source, &starts[..info.times.len()], &progress, |track| {
-        let mut misfit = FitError::default();
-        (fit_lines(track, &tolerance, &mut misfit), misfit)
-    })?;
-    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(FitError::default(), FitError::merged_with);
+    let times = &starts[..info.times.len()];
+    let (found, misfit) = fit_tracks(source, times, events, |track, misfit| fit_lines(track, &tolerance, misfit))?;
     let mut set = GaussianSet {
         sh_degree: info.sh_degree as u8,
         sh_coefficients: (info.sh_degree + 1).pow(2) - 1,
         sh: (info.sh_degree > 0).then(Vec::new),
         ..GaussianSet::default()
     };
-    for piece in found.iter().flat_map(|(pieces, _)| pieces) {
+    for piece in found.iter().flatten() {
         add_piece(&mut set, piece, &starts);
     }
     let pieces = set.count();
     let options = WriteOptions { library: TOOL.to_owned(), ..WriteOptions::default() };
     let wanted = set.positions.clone();
     snap_to_grid(&mut set, &options);
-    let ids: Vec<usize> =
-        found.iter().enumerate().flat_map(|(id, (pieces, _))| pieces.iter().map(move |_| id)).collect();
+    let ids: Vec<usize> = found.iter().enumerate().flat_map(|(id, pieces)| pieces.iter().map(move |_| id)).collect();
     check_positions(&set, &wanted, ids.iter().copied())?;
     let refused = |error: fourdgs::Error| {
         let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
@@ -67,12 +62,9 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     let bytes = write_to_vec(&set, starts[info.times.len()], &options, &SceneExtras::default()).map_err(refused)?;
     std::fs::write(path, bytes).map_err(Error::io("write", path))?;
     Ok(format!(
-        "{} Gaussians became {pieces} pieces of straight motion at {FRAME_RATE} frames a second; error of positions, as \
-         a fraction of the Gaussian's middle scale: {:.3} rms, {:.3} at most; error of opacities: {:.3} at most",
+        "{} Gaussians became {pieces} pieces of straight motion at {FRAME_RATE} frames a second; {}",
         info.count,
-        misfit.rms(),
-        misfit.max_position_error,
-        misfit.max_opacity_error
+        misfit.error_note()
     ))
 }
 

@@ -16,6 +16,30 @@ pub mod kind;
 pub mod rows;
 pub mod time_windows;
 
+use crate::error::Result;
+use crate::fit::{FitError, FittedTrack};
+use crate::passes::map_tracks;
+use crate::progress::Events;
+use crate::source::FrameSource;
+
+/// Fits motions to the track of every Gaussian of `source`. `times` holds the times of the frames, in any unit. `fit`
+/// returns the motions for one track, and adds their errors to the given record. Returns the motions of each Gaussian,
+/// and the errors of all of them.
+fn fit_tracks<T: Send>(
+    source: &dyn FrameSource,
+    times: &[f64],
+    events: &Events,
+    fit: impl Fn(&FittedTrack, &mut FitError) -> Vec<T> + Sync,
+) -> Result<(Vec<Vec<T>>, FitError)> {
+    let progress = events.task("emit", "states", (source.info().count * times.len()) as u64);
+    let found = map_tracks(source, times, &progress, |track| {
+        let mut misfit = FitError::default();
+        (fit(track, &mut misfit), misfit)
+    })?;
+    let (motions, misfits): (Vec<Vec<T>>, Vec<FitError>) = found.into_iter().unzip();
+    Ok((motions, misfits.into_iter().fold(FitError::default(), FitError::merged_with)))
+}
+
 #[cfg(test)]
 mod tests {
     use crate::model::{Gaussians, opacity};

@@ -11,10 +11,9 @@ use std::path::Path;
 use npyz::WriterBuilder;
 use npyz::npz::NpzWriter;
 use zip::write::FileOptions;
-use zip::{CompressionMethod, DateTime};
 
 use crate::error::{Error, Result};
-use crate::files::zip_output::ZipOutput;
+use crate::files::zip_output::{ZipOutput, stored_file_options};
 use crate::model::{self, Statistic, StatisticRows};
 
 /// Statistics and scores of N Gaussians, and whether the selection keeps each of them. Every slice has one value per
@@ -113,12 +112,8 @@ impl RowTable<'_> {
 
     fn write_npz_to(&self, out: impl Write + io::Seek) -> io::Result<()> {
         let mut archive = NpzWriter::new(ZipOutput::new(out));
-        // An entry has at most 8 bytes per Gaussian and a header. Beyond 4 GiB it needs the 64-bit zip format.
-        let large = self.rows.len() as u64 * 8 + 4096 > u64::from(u32::MAX);
-        let options = FileOptions::default()
-            .compression_method(CompressionMethod::Stored)
-            .last_modified_time(DateTime::default())
-            .large_file(large);
+        // An entry has at most 8 bytes per Gaussian and a header.
+        let options = stored_file_options(self.rows.len() as u64 * 8 + 4096);
         for (name, values) in self.columns() {
             match values {
                 TableColumn::F64(values) => add_array(&mut archive, name, options, values)?,

@@ -16,8 +16,9 @@ use crate::files::tsog::write::{MAX_FRAMES, write_tsog};
 use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::fit::{CubicTrack, CurveForm, FitError, MIN_VISIBLE_OPACITY, Tolerance, fit_curves};
 use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams, logit, opacity};
+use crate::outputs::fit_tracks;
 use crate::outputs::kind::OutputKind;
-use crate::passes::{FrameStates, map_tracks};
+use crate::passes::FrameStates;
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
@@ -172,7 +173,6 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
 /// for the format `kind`. Returns the fitted Gaussians and the error of the fit.
 fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<FittedWindows> {
     let info = source.info();
-    let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let clip = ClipTimes::from_times(&info.times);
     let times: Vec<f64> = info.times.iter().map(|&time| clip.to_unit(time)).collect();
     let (tolerance, form) = match kind {
@@ -181,13 +181,10 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
         }
         _ => (Tolerance::default(), CurveForm::linear_with_min_width(std::f64::consts::SQRT_2 * MIN_TIME_DEVIATION)),
     };
-    let found = map_tracks(source, &times, &progress, |track| {
-        let mut misfit = FitError::default();
-        (fit_curves(track, form, &tolerance, &mut misfit), misfit)
-    })?;
-    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(FitError::default(), FitError::merged_with);
-    let all = found.iter().map(|(lines, _)| lines.len()).sum::<usize>();
-    let lines: Vec<&CubicTrack> = found.iter().flat_map(|(lines, _)| lines).filter(|line| is_finite(line)).collect();
+    let (found, misfit) =
+        fit_tracks(source, &times, events, |track, misfit| fit_curves(track, form, &tolerance, misfit))?;
+    let all = found.iter().map(Vec::len).sum::<usize>();
+    let lines: Vec<&CubicTrack> = found.iter().flatten().filter(|line| is_finite(line)).collect();
     let mut params = StoredParams {
         gaussians: Gaussians::zeros(lines.len(), info.sh_degree),
         format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, lines.len()),

@@ -81,9 +81,6 @@ pub(crate) const PER_BYTE: usize = 512;
 
 /// Memory limit of most readers, in bytes.
 const SMALL_BYTES: usize = 32 << 20;
-/// Memory limit of the readers of JSON, in bytes. They read through a buffer and keep one string of at most a megabyte
-/// at a time.
-const JSON_BYTES: usize = 4 << 20;
 /// Memory limit of the reader of pickles, in bytes: the 1 MiB that it is given, and space for messages.
 const PICKLE_BYTES: usize = (1 << 20) + (64 << 10);
 /// Memory limit of the reader of containers, in bytes. A tile may hold 256 MiB (format/SPEC.md), decoded next to its
@@ -94,7 +91,7 @@ const CONTAINER_BYTES: usize = 640 << 20;
 const ARCHIVE_BYTES: usize = 256 << 20;
 
 /// List of all readers of user-supplied bytes.
-pub(crate) const ENTRIES: [Entry; 25] = [
+pub(crate) const ENTRIES: [Entry; 24] = [
     Entry {
         name: "archive",
         corpus: "archive",
@@ -130,13 +127,6 @@ pub(crate) const ENTRIES: [Entry; 25] = [
     Entry { name: "ftgs", corpus: "ftgs", read: ftgs, repair_checksums: |_| None, most_bytes: SMALL_BYTES },
     Entry { name: "params", corpus: "params", read: params, repair_checksums: repair_zip, most_bytes: SMALL_BYTES },
     Entry { name: "pickle", corpus: "pickle", read: pickle, repair_checksums: repair_zip, most_bytes: SMALL_BYTES },
-    Entry {
-        name: "cameras_json",
-        corpus: "cameras",
-        read: cameras_json,
-        repair_checksums: |_| None,
-        most_bytes: JSON_BYTES,
-    },
     Entry {
         name: "pickle_bytes",
         corpus: "pickle_bytes",
@@ -389,12 +379,6 @@ fn pickle(bytes: &[u8], folder: &InputFolder) -> Outcome {
 /// Reads a pickle that is not in a zip archive, with a memory limit of 1 MiB.
 fn pickle_bytes(bytes: &[u8], _: &InputFolder) -> Outcome {
     parser_checks::check_pickle(bytes, 1 << 20).map(drop).ok_or_else(|| "no pickle".into())
-}
-
-/// Reads JSON with the streaming parser of camera files.
-fn cameras_json(bytes: &[u8], _: &InputFolder) -> Outcome {
-    parser_checks::check_cameras_json(bytes)?;
-    Ok(())
 }
 
 fn container(bytes: &[u8], folder: &InputFolder) -> Outcome {

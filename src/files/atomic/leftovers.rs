@@ -23,8 +23,7 @@ const MAX_WAIT: Duration = Duration::from_secs(60);
 /// Maximum time to wait while another run inspects an unfinished workspace (hidden folder of a killed run), which takes
 /// microseconds.
 const MAX_INSPECTION_WAIT: Duration = Duration::from_secs(5);
-/// Maximum length in bytes of a stored [`Journal`]: the list of the files of one result, which are renamed to their
-/// final names as a unit.
+/// Maximum length in bytes of a stored [`PublicationJournal`].
 const MAX_JOURNAL: u64 = 1 << 20;
 
 /// Lock that a run holds while it moves a result to its final name or repairs an interrupted move to that name.
@@ -75,7 +74,7 @@ impl PublishLock {
 /// List of the files of one result, in the order in which they are renamed to their final names. The renames are a
 /// unit: if they are interrupted, the next run completes or reverts all of them.
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct Journal {
+pub(super) struct PublicationJournal {
     pub(super) replace: Replace,
     /// For each file, its name in the workspace (hidden folder) and its final name in the folder that holds the
     /// workspace.
@@ -220,7 +219,7 @@ fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path)
     let mut text = Vec::new();
     let mut file = folder.open_file(JOURNAL, false).map_err(failed)?;
     (&mut file).take(MAX_JOURNAL).read_to_end(&mut text).map_err(failed)?;
-    let journal: Journal = serde_json::from_slice(&text).map_err(|error| failed(error.into()))?;
+    let journal: PublicationJournal = serde_json::from_slice(&text).map_err(|error| failed(error.into()))?;
     for (content, published) in &journal.files {
         let is_beside = published.as_encoded_bytes().starts_with(name.as_encoded_bytes());
         if !is_beside || Path::new(published).components().count() != 1 || !folder.has(content) {

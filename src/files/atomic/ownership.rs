@@ -16,7 +16,7 @@ use crate::error::{Error, Result, ShowPath, quoted};
 
 /// Name of the summary file, which identifies a folder as a result of this program. The file is a JSON object. Its
 /// member `tool` names the program, and its member `files` lists the files of the result.
-/// [`super::StagedFolder::commit`] and [`super::StagedFiles::commit`] add this list.
+/// [`super::StagedFolder::commit`] and [`super::StagedFile::commit`] add this list.
 pub const SUMMARY_FILE: &str = "summary.json";
 
 /// Maximum length in bytes of the name of an output: 255, the limit of common file systems, less the 24 bytes that the

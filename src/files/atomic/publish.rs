@@ -7,7 +7,7 @@ use std::path::Path;
 use splat_platform::{FolderHandle, sync_file, sync_folder};
 
 use super::destination::{Replace, TargetKind, check_replace};
-use super::leftovers::{Journal, PublishLock, finish_publication, repair};
+use super::leftovers::{PublicationJournal, PublishLock, finish_publication, repair};
 use super::ownership::{exists, split_target};
 use super::warnings::warn;
 use super::workspace::{JOURNAL, REPLACED, Workspace, live_workspaces};
@@ -53,7 +53,7 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
 /// for existing targets.
 fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let names = files.iter().map(|(content, target)| Ok((content.clone(), split_target(target)?.1.to_owned())));
-    let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };
+    let journal = PublicationJournal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };
     let text = serde_json::to_vec(&journal).expect("plain data");
     // Write the journal under another name until it is complete, so that a file called `journal` is never partial.
     let (begun, path) = (workspace.folder.join("journal-begun"), workspace.folder.join(JOURNAL));

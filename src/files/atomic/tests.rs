@@ -352,9 +352,9 @@ fn a_summary_lists_its_files_and_keeps_its_order() {
 
 /// Writes `x.ply` and its two companions under hidden names, and returns the handle that publishes them in `base` with
 /// the policy `replace`. The output and one companion hold `text`; the other companion is a summary.
-fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
+fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFile> {
     let companions = ["x.ply.summary.json", "x.ply.recipe.toml"].map(|name| base.join(name)).to_vec();
-    let staged = StagedFiles::new(&base.join("x.ply"), companions, replace)?;
+    let staged = StagedFile::with_companions(&base.join("x.ply"), companions, replace)?;
     write_file(staged.path(), text);
     write_file(&staged.companion_path(0), r#"{"tool": "splatsieve 0.1.0"}"#);
     write_file(&staged.companion_path(1), text);
@@ -383,7 +383,7 @@ fn leave_half_published(base: &Path, published: usize, replace: Replace) {
         write_file(&if index < published { base.join(name) } else { left.join(content) }, "of the killed run");
     }
     let files = files.map(|(content, name)| (content.to_owned(), name.into())).to_vec();
-    let journal = serde_json::to_string(&leftovers::Journal { replace, files }).unwrap();
+    let journal = serde_json::to_string(&leftovers::PublicationJournal { replace, files }).unwrap();
     write_file(&left.join("journal"), &journal);
 }
 

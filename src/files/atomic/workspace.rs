@@ -125,12 +125,6 @@ impl Workspace {
         self.folder.join(CONTENT)
     }
 
-    /// Returns whether the workspace holds an earlier output folder, or a journal of files to be renamed. Both are
-    /// needed to repair an interrupted move of a result, so such a workspace must not be deleted.
-    fn is_unfinished(&self) -> bool {
-        UNFINISHED.iter().any(|name| exists(&self.folder.join(name)))
-    }
-
     /// Syncs the lock file and the list of entries of the workspace folder to disk, but not the output in it.
     pub(super) fn sync(&self) -> io::Result<()> {
         if let Some(lock) = &self.lock {
@@ -144,10 +138,16 @@ impl Drop for Workspace {
     fn drop(&mut self) {
         let mut live = live_workspaces();
         live.remove(&self.folder);
-        if !self.is_unfinished() {
+        if !must_stay(&self.folder) {
             remove_workspace(&self.folder, self.identity, self.lock.take());
         }
     }
+}
+
+/// Returns whether the workspace at the path `folder` holds an earlier output folder, or a journal of files to be
+/// renamed. Both are needed to repair an interrupted move of a result, so such a workspace must not be deleted.
+fn must_stay(folder: &Path) -> bool {
+    UNFINISHED.iter().any(|name| exists(&folder.join(name)))
 }
 
 /// Returns the name of the hidden folder that serves as a lock while a result called `name` is moved to its final path.
@@ -230,7 +230,7 @@ pub struct ExitGuard(
 pub fn remove_unfinished() -> ExitGuard {
     let mut live = live_workspaces();
     for (folder, identity) in std::mem::take(&mut *live) {
-        if UNFINISHED.iter().any(|name| exists(&folder.join(name))) {
+        if must_stay(&folder) {
             continue;
         }
         // Threads that are still writing into the folder fail from now on, because its path is gone.

@@ -8,8 +8,9 @@ use glam::{DMat3, DVec3};
 use hashbrown::{DefaultHashBuilder, HashSet, HashTable};
 
 use super::fields::place;
+use super::memory::MemoryCounter;
 use super::{MAX_IMAGES, MAX_SIDE_PX};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, RigView, Split};
 
@@ -65,7 +66,7 @@ impl RigBuilder {
     pub(super) fn new(memory: ReadLimit) -> RigBuilder {
         RigBuilder {
             rig: Rig { cameras: Vec::new(), views: Vec::new(), background: None, origin: String::new() },
-            memory_counter: MemoryCounter { limit: memory, used: 0 },
+            memory_counter: MemoryCounter::new(memory),
             camera_indices: HashTable::new(),
             hasher: DefaultHashBuilder::default(),
             untimed: HashSet::new(),
@@ -100,6 +101,21 @@ impl RigBuilder {
         self.files.push((file.to_owned(), self.rig.views.len()));
         self.images_added = 0;
         Ok(())
+    }
+
+    /// Starts a camera file of `cameras` cameras, each with an image at each of `frames` frames.
+    ///
+    /// # Errors
+    /// Fails with [`Error::Usage`] if there are too many images, and like [`RigBuilder::begin_file`].
+    pub(super) fn begin_frames(&mut self, file: &Path, cameras: usize, frames: usize) -> Result<()> {
+        let images = cameras.saturating_mul(frames);
+        if images > MAX_IMAGES {
+            let file = file.shown();
+            return Err(Error::usage(format!(
+                "{file}: {cameras} cameras × {frames} frames are more than {MAX_IMAGES} images"
+            )));
+        }
+        self.begin_file(file, images)
     }
 
     /// Adds the image `listed`, which belongs to the file that was last passed to [`RigBuilder::begin_file`].
@@ -209,32 +225,6 @@ impl RigBuilder {
             }
         }
         Ok(Rig { background, origin, ..self.rig })
-    }
-}
-
-/// Counter of the bytes of memory that are in use while cameras are read, and their limit.
-#[derive(Debug)]
-pub(super) struct MemoryCounter {
-    limit: ReadLimit,
-    used: u64,
-}
-
-impl MemoryCounter {
-    /// Counts `bytes` of memory that are about to be allocated. For the error message, `path` is the file, `place` the
-    /// position in the file, and `what` the purpose of the memory.
-    ///
-    /// # Errors
-    /// Fails if the memory limit for reading would be exceeded.
-    pub(super) fn take(&mut self, path: &Path, place: &str, what: &str, bytes: u64) -> Result<()> {
-        let used = self.used.saturating_add(bytes);
-        self.limit.check(path, place, what, used)?;
-        self.used = used;
-        Ok(())
-    }
-
-    /// Subtracts `bytes` bytes, which have been freed, from the counted memory.
-    pub(super) fn release(&mut self, bytes: u64) {
-        self.used = self.used.saturating_sub(bytes);
     }
 }
 

@@ -23,42 +23,36 @@ use std::path::Path;
 
 use super::CameraOptions;
 use super::assemble::{ListedImage, RigBuilder, from_camera_to_world, view_in_name};
-use super::fields::{CameraFields, place};
-use super::image_list::each_image;
+use super::fields::{CameraFields, elements, place, read_camera_text};
 use super::times::{self, TimesSource};
 use crate::error::Result;
-use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Keys of an image entry in a `cameras.json` in this project's own format.
-const IMAGE_KEYS: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
-/// Keys of a camera entry in a `cameras.json` of 3DGS.
-const CAMERA_KEYS: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
-
-/// Reads the cameras of `file`, a `cameras.json` in this project's own format. `outline` is the document without the
-/// list of images.
-pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimit) -> Result<Rig> {
-    let shared = CameraFields::new(file, None, outline)?;
+/// Reads the cameras of `file`, a `cameras.json` in this project's own format.
+pub(super) fn load_per_image(file: &Path, memory: ReadLimit) -> Result<Rig> {
+    let mut builder = RigBuilder::new(memory);
+    let text = read_camera_text(file, builder.memory_counter())?;
+    let shared = CameraFields::new(file, None, &text)?;
     let background = shared.optional_vector("background")?;
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
         return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
     }
-    let mut builder = RigBuilder::new(memory);
-    builder.begin_file(file, shared.list_len("frames")?)?;
-    each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
-        builder.add(per_image(file, CameraFields::new(file, Some(index), frame)?)?)
-    })?;
+    let images = shared.list("frames", builder.memory_counter())?;
+    builder.begin_file(file, images.len())?;
+    for (index, image) in images.into_iter().enumerate() {
+        builder.add(per_image(file, &CameraFields::new(file, Some(index), image.get())?)?)?;
+    }
     let background = background.map(|rgb| rgb.map(|c| c as f32));
     builder.finish(background, shown_name(file))
 }
 
 /// Builds a list entry of one image (camera, time, split, path) from `fields`, the JSON object of this image in a
 /// `cameras.json` in this project's own format.
-fn per_image(file: &Path, fields: CameraFields<'_>) -> Result<ListedImage> {
+fn per_image(file: &Path, fields: &CameraFields<'_>) -> Result<ListedImage> {
     let (rotation, translation) = fields.pose("w2c")?;
-    let split = match fields.optional_text("split")? {
+    let split = match fields.optional_text("split")?.as_deref() {
         None | Some("train") => Split::Train,
         Some("test") => Split::Test,
         Some("val") => Split::Val,
@@ -84,45 +78,45 @@ fn per_image(file: &Path, fields: CameraFields<'_>) -> Result<ListedImage> {
     })
 }
 
-/// Reads the `cameras.json` of a 3DGS model folder, a list of `count` cameras.
-pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
+/// Reads the `cameras.json` of a 3DGS model folder, a list of cameras.
+pub(super) fn load_per_camera(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let mut builder = RigBuilder::new(options.memory);
-    builder.begin_file(file, count)?;
+    let text = read_camera_text(file, builder.memory_counter())?;
+    let cameras = elements(file, &text, builder.memory_counter())?;
+    builder.begin_file(file, cameras.len())?;
     let mut origin = shown_name(file);
     let mut times = Vec::new();
     if options.times != TimesSource::Own {
         let mut names: Vec<Box<str>> = Vec::new();
-        each_image(file, None, &["img_name"], |index, camera| {
-            let name = match camera.get("img_name") {
-                Some(SmallValue::Text(name)) => name.clone(),
-                _ => "".into(),
-            };
+        for (index, camera) in cameras.iter().enumerate() {
+            let name = CameraFields::new(file, Some(index), camera.get())?.optional_text("img_name")?;
+            let name = name.unwrap_or_default();
             builder.memory_counter().take(file, &place(Some(index)), "the names of images", name.len() as u64 + 96)?;
-            names.push(name);
-            Ok(())
-        })?;
+            names.push(name.into());
+        }
         let (given, source) = times::resolve(file, &names, &options.times, builder.memory_counter())?;
         origin += &format!(" ({source})");
         times = given;
     }
-    each_image(file, None, &CAMERA_KEYS, |index, camera| {
+    for (index, camera) in cameras.into_iter().enumerate() {
         let time = times.get(index).copied().flatten();
-        builder.add(ListedImage { time, ..per_camera(file, CameraFields::new(file, Some(index), camera)?)? })
-    })?;
+        let fields = CameraFields::new(file, Some(index), camera.get())?;
+        builder.add(ListedImage { time, ..per_camera(file, &fields)? })?;
+    }
     builder.finish(None, origin)
 }
 
 /// Builds a list entry of one image from `fields`, the JSON object of one camera in a `cameras.json` of 3DGS. The list
 /// entry holds the camera, the path of the image file and the view number, but no time.
-fn per_camera(file: &Path, fields: CameraFields<'_>) -> Result<ListedImage> {
+fn per_camera(file: &Path, fields: &CameraFields<'_>) -> Result<ListedImage> {
     let size @ (width, height) = (fields.side("width")?, fields.side("height")?);
     let intrinsics = [fields.number("fx")?, fields.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];
     let name = fields.optional_text("img_name")?;
     Ok(ListedImage {
-        camera: from_camera_to_world(size, intrinsics, fields.matrix3("rotation")?, fields.vector("position")?.into()),
+        camera: from_camera_to_world(size, intrinsics, fields.matrix3("rotation")?, fields.vector("position")?),
         time: None,
         split: Split::Train,
-        image: name.map(|name| file.with_file_name(name)),
-        view: name.and_then(view_in_name),
+        image: name.as_deref().map(|name| file.with_file_name(name)),
+        view: name.as_deref().and_then(view_in_name),
     })
 }

@@ -15,8 +15,9 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
-use super::assemble::{ListedImage, MemoryCounter, RigBuilder};
-use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX, TimesSource, frames, times};
+use super::assemble::{ListedImage, RigBuilder};
+use super::memory::MemoryCounter;
+use super::{CameraOptions, MAX_SIDE_PX, TimesSource, frames, times};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::open::open_file;
@@ -119,16 +120,9 @@ pub(super) fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     };
     if let (Some(first), TimesSource::Own) = (frames::find(&folder), &options.times) {
         let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
-        if listed.len().saturating_mul(frames) > MAX_IMAGES {
-            return Err(Error::usage(format!(
-                "{}: {} cameras × {frames} frames are more than {MAX_IMAGES} images",
-                folder.shown(),
-                listed.len()
-            )));
-        }
         let origin = format!("{} (each of {frames} frames)", shown_reconstruction(&folder));
         let first_frame = listed.iter().map(listed_image).collect::<Result<Vec<_>>>()?;
-        builder.begin_file(&images, listed.len() * frames)?;
+        builder.begin_frames(&images, listed.len(), frames)?;
         frames::repeat_for_frames(&first_frame, &first, frames).try_for_each(|image| builder.add(image))?;
         return builder.finish(None, origin);
     }

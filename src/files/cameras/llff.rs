@@ -12,9 +12,10 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 use npyz::{NpyFile, Order, TypeChar};
 
-use super::assemble::{ListedImage, MemoryCounter, RigBuilder, check, from_camera_to_world};
-use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX};
-use crate::error::ShowPath;
+use super::assemble::{ListedImage, RigBuilder, check, from_camera_to_world};
+use super::fields::side;
+use super::memory::MemoryCounter;
+use super::{CameraOptions, MAX_SIDE_PX};
 use crate::error::{Error, Result};
 use crate::files::names::shown_name;
 use crate::files::npy::{HEAD, header_is_sound};
@@ -37,18 +38,11 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let cameras =
         rows.iter().enumerate().map(|(index, row)| camera(file, index, row, options)).collect::<Result<Vec<_>>>()?;
     let frames = options.frames.unwrap_or(DEFAULT_FRAMES);
-    if frames.saturating_mul(cameras.len()) > MAX_IMAGES {
-        return Err(Error::usage(format!(
-            "{}: {} cameras × {frames} frames are more than {MAX_IMAGES} images",
-            file.shown(),
-            cameras.len()
-        )));
-    }
     let mut origin = shown_name(file);
     if options.frames.is_none() {
         origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
     }
-    builder.begin_file(file, frames * cameras.len())?;
+    builder.begin_frames(file, cameras.len(), frames)?;
     listed_images(&cameras, frames).try_for_each(|image| builder.add(image))?;
     builder.finish(None, origin)
 }
@@ -70,14 +64,13 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
     let wrong = |expected: String, found: String| Error::input(file, format!("row {index}"), expected, found);
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
     let [height, width, focal] = column(4).to_array();
-    let side = |side: f64| side.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&side);
-    if !side(width) || !side(height) {
+    let (Some(full_width), Some(full_height)) = (side(width), side(height)) else {
         let expected = format!("height and width of 1 to {MAX_SIDE_PX} whole pixels in columns 4 and 9");
         return Err(wrong(expected, format!("{height} and {width}")));
-    }
+    };
     // Half the size, but at least one pixel, in case a side of the image is only one pixel.
-    let half = |side: f64| ((side as u32) / 2).max(1);
-    let (width_px, height_px) = options.size.unwrap_or((half(width), half(height)));
+    let half = |side: u32| (side / 2).max(1);
+    let (width_px, height_px) = options.size.unwrap_or((half(full_width), half(full_height)));
     let focal = focal * f64::from(width_px) / width;
     let camera_to_world = DMat3::from_cols(column(1), column(0), -column(2));
     let intrinsics = [focal, focal, 0.5 * f64::from(width_px), 0.5 * f64::from(height_px)];

@@ -13,17 +13,16 @@
 //! "i/n" means that frame i of n frames is at time i/n.
 //!
 //! All cameras are returned in OpenCV axes, world to camera, in f64. Rotation matrices are checked to be rotations.
-//! Memory: one record per image; the size of all records is checked against the memory limit for reading before they
-//! are allocated. JSON and text files are read as streams: once for the keys outside the list of images, and once for
-//! the images.
+//! Memory: one record per image, and the text of a JSON file; both are checked against the memory limit for reading
+//! before they are allocated. Other text files are read line by line.
 
 mod assemble;
 mod cameras_json;
 mod colmap;
 mod fields;
 mod frames;
-mod image_list;
 mod llff;
+mod memory;
 mod meta_json;
 mod nerfies;
 mod times;
@@ -37,11 +36,11 @@ use std::path::{Path, PathBuf};
 
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
-use crate::files::json::small::SmallValue;
 use crate::limits::ReadLimit;
 use crate::model::Rig;
 
-use image_list::outline;
+use fields::{CameraFields, read_camera_text, shorten};
+use memory::MemoryCounter;
 pub use times::TimesSource;
 pub use virtual_rig::{surrounding_rig, virtual_rig};
 
@@ -118,31 +117,17 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     if is_colmap(&file) {
         return colmap::load(&file, options);
     }
-    let timed = || match options.times {
-        TimesSource::Own => Ok(()),
-        _ => Err(Error::usage(format!("{}: --times is for cameras without times of their own", file.shown()))),
-    };
-    if file.ends_with(NERFIES) {
-        timed()?;
-        return nerfies::load(&file, options);
+    let kind = kind(&file, options.memory)?;
+    if kind != Kind::PerCamera && options.times != TimesSource::Own {
+        return Err(Error::usage(format!("{}: --times is for cameras without times of their own", file.shown())));
     }
-    if file.extension().is_some_and(|extension| extension == "npy") {
-        timed()?;
-        return llff::load(&file, options);
-    }
-    let outline = outline(&file)?;
-    match kind(&outline) {
-        Some(Kind::Transforms) => timed().and_then(|()| transforms::load(&file, path.is_dir(), options)),
-        Some(Kind::PerImage) => timed().and_then(|()| cameras_json::load_per_image(&file, &outline, options.memory)),
-        Some(Kind::PerCamera(count)) => cameras_json::load_per_camera(&file, count, options),
-        Some(Kind::PerFrame) => timed().and_then(|()| meta_json::load(&file, path.is_dir(), options.memory)),
-        None => Err(Error::input(
-            &file,
-            "",
-            "a list of cameras, or an object with a non-empty list \"frames\" of objects with \
-             \"transform_matrix\" or \"w2c\"",
-            outline.describe(),
-        )),
+    match kind {
+        Kind::Nerfies => nerfies::load(&file, options),
+        Kind::Llff => llff::load(&file, options),
+        Kind::Transforms => transforms::load(&file, path.is_dir(), options),
+        Kind::PerImage => cameras_json::load_per_image(&file, options.memory),
+        Kind::PerCamera => cameras_json::load_per_camera(&file, options),
+        Kind::PerFrame => meta_json::load(&file, path.is_dir(), options.memory),
     }
 }
 
@@ -190,35 +175,51 @@ fn is_colmap(path: &Path) -> bool {
     COLMAP.iter().any(|name| path.ends_with(name))
 }
 
-/// Format of a JSON camera file.
+/// Format of a camera file that is not a COLMAP reconstruction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
+    /// `dataset.json` of NeRFies and HyperNeRF.
+    Nerfies,
+    /// `poses_bounds.npy` of LLFF and DyNeRF.
+    Llff,
     /// `transforms*.json` of NeRF: camera-to-world poses in OpenGL axes, one entry per image.
     Transforms,
     /// This project's `cameras.json`: one entry per image.
     PerImage,
-    /// 3DGS `cameras.json`: one entry per camera. Holds the number of cameras.
-    PerCamera(usize),
+    /// 3DGS `cameras.json`: one entry per camera.
+    PerCamera,
     /// `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: one list of cameras per frame.
     PerFrame,
 }
 
-/// Returns the format of a JSON camera file, recognized by the keys in its `outline` (the document without its images);
-/// `None` if the format is unknown.
-fn kind(outline: &SmallValue) -> Option<Kind> {
-    if let SmallValue::List(_, count) = outline {
-        return Some(Kind::PerCamera(*count));
+/// Returns the format of the camera file `file`, recognized by its name or by the keys of its JSON text. Fails if the
+/// text is not JSON or if the format is unknown. `memory` limits the memory.
+fn kind(file: &Path, memory: ReadLimit) -> Result<Kind> {
+    if file.ends_with(NERFIES) {
+        return Ok(Kind::Nerfies);
     }
-    if meta_json::is_meta_json(outline) {
-        return Some(Kind::PerFrame);
+    if file.extension().is_some_and(|extension| extension == "npy") {
+        return Ok(Kind::Llff);
     }
-    let SmallValue::List(first, _) = outline.get("frames")? else { return None };
-    let first = first.first()?;
-    if first.get("w2c").is_some() {
-        Some(Kind::PerImage)
-    } else if first.get("transform_matrix").is_some() {
-        Some(Kind::Transforms)
-    } else {
-        None
+    let mut counter = MemoryCounter::new(memory);
+    let text = read_camera_text(file, &mut counter)?;
+    if text.trim_start().starts_with('[') {
+        return Ok(Kind::PerCamera);
+    }
+    let fields = CameraFields::new(file, None, &text)?;
+    if fields.is_list("k") && fields.is_list("w2c") {
+        return Ok(Kind::PerFrame);
+    }
+    let images = if fields.is_list("frames") { fields.list("frames", &mut counter)? } else { Vec::new() };
+    let first = images.first().map(|image| CameraFields::new(file, Some(0), image.get())).transpose()?;
+    match first {
+        Some(first) if first.has("w2c") => Ok(Kind::PerImage),
+        Some(first) if first.has("transform_matrix") => Ok(Kind::Transforms),
+        _ => {
+            let expected = "a list of cameras, or an object with a non-empty list \"frames\" of objects with \
+                            \"transform_matrix\" or \"w2c\"";
+            Err(Error::input(file, "", expected, shorten(&text)))
+        }
     }
 }
 

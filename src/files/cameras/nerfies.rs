@@ -11,23 +11,25 @@
 //!   6, 10, … are test images if a training image follows.
 //! - Images are those of `rgb/2x`, half the size in the camera files, unless `--resolution` gives another.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
-use hashbrown::{HashMap, HashSet};
+use hashbrown::HashSet;
+use serde_json::value::RawValue;
 
 use super::CameraOptions;
-use super::assemble::{ListedImage, MemoryCounter, RigBuilder, from_camera_to_world};
-use super::fields::CameraFields;
-use super::image_list::read_keys;
+use super::assemble::{ListedImage, RigBuilder, from_camera_to_world};
+use super::fields::{CameraFields, read_camera_text};
+use super::memory::MemoryCounter;
 use crate::error::{Error, Result, quoted};
 use crate::files::image::measure;
-use crate::files::json::lists::{ElementPosition, ListSelection, each_element, each_entry};
-use crate::files::json::small::SmallValue;
+use crate::files::json::parse;
 use crate::files::names::shown_name;
+use crate::files::text::read_text;
 use crate::model::{Rig, Split};
 
-/// Keys that are read from `camera/ID.json`, the camera file of the image called ID.
-const CAMERA_KEYS: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
+/// Maximum length in bytes of `camera/ID.json`, the camera file of the image called ID.
+const MAX_CAMERA_BYTES: u64 = 1 << 20;
 /// Interval of training images in a data set that names no test images: every image whose index is a multiple of this
 /// number is a training image.
 const TRAIN_EVERY: usize = 4;
@@ -62,69 +64,40 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
 const LIST_KEYS: [&str; 3] = ["ids", "val_ids", "train_ids"];
 /// Bytes of memory per image name in addition to its text: its entries in a list and in two tables.
 const NAME_OVERHEAD_BYTES: u64 = 200;
+/// Bytes of memory of the parsed `metadata.json` per byte of its text, at most: an entry has at least 6 bytes of text.
+const METADATA_FACTOR: u64 = 16;
 
 /// Reads the three lists of image names in `file` and returns them in this order: all images, test images, training
 /// images. `train_ids` may be missing if `val_ids` is empty.
-fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
-    let outline = read_keys(file, &LIST_KEYS)?;
-    let fields = CameraFields::new(file, None, &outline)?;
-    let held_out = fields.list_len(LIST_KEYS[1])?;
-    fields.list_len(LIST_KEYS[0])?;
-    if held_out > 0 {
-        fields.list_len(LIST_KEYS[2])?;
-    }
-    let mut names = [const { Vec::new() }; 3];
-    each_element(
-        file,
-        ListSelection { keys: &LIST_KEYS, nested: false, element_keys: &[] },
-        |ElementPosition { key, index, .. }, name| {
-            if index != names[key].len() {
-                return Err(Error::input(file, format!("key \"{}\"", LIST_KEYS[key]), "this key once", "twice"));
-            }
-            let SmallValue::Text(name) = name else {
-                let place = format!("key \"{}\", element {index}", LIST_KEYS[key]);
-                return Err(Error::input(file, place, "a list of names", name.describe()));
-            };
-            counter.take(file, "", "the names of its images", name.len() as u64 + NAME_OVERHEAD_BYTES)?;
-            names[key].push(name);
-            Ok(())
-        },
-    )?;
-    Ok(names)
+fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<String>; 3]> {
+    let text = read_camera_text(file, counter)?;
+    let fields = CameraFields::new(file, None, &text)?;
+    let [ids, val, train] = LIST_KEYS.map(|key| fields.texts(key, NAME_OVERHEAD_BYTES, counter));
+    let (ids, val) = (ids?, val?);
+    let train = if val.is_empty() { Vec::new() } else { train? };
+    Ok([ids, val, train])
 }
 
 /// Reads the `warp_id` (time index) of each image in `ids` from `file`, the `metadata.json` of the data set. `counter`
 /// limits the memory.
-fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
-    counter.take(file, "", "the times of its images", 64 * ids.len() as u64)?;
-    // Give each distinct name one index, because a name may occur twice in `ids`.
-    let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
-    let mut found = Vec::new();
-    for id in ids {
-        places.entry(id).or_insert_with(|| {
-            found.push(None);
-            found.len() as u32 - 1
-        });
-    }
-    each_entry(file, &["warp_id"], |id, own| {
-        if let Some(&place) = places.get(id) {
-            let own = CameraFields::new(file, None, &own)?;
-            found[place as usize] =
-                Some(own.optional_index("warp_id")?.ok_or_else(|| own.wrong("warp_id", "a number"))?);
-        }
-        Ok(())
-    })?;
-    let warp = |id: &str| {
-        let warp = places.get(id).and_then(|&place| found[place as usize]);
-        warp.ok_or_else(|| Error::input(file, "", format!("the image {}", quoted(id)), "none of this name"))
+fn warps(file: &Path, ids: &[String], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
+    let text = read_camera_text(file, counter)?;
+    counter.take(file, "", "the times of its images", METADATA_FACTOR * text.len() as u64 + 4 * ids.len() as u64)?;
+    let images: BTreeMap<String, &RawValue> = parse(&text, file)?;
+    let warp = |id: &String| {
+        let image = images
+            .get(id)
+            .ok_or_else(|| Error::input(file, "", format!("the image {}", quoted(id)), "none of this name"))?;
+        let fields = CameraFields::new(file, None, image.get())?;
+        fields.optional_index("warp_id")?.ok_or_else(|| fields.wrong("warp_id", "a number"))
     };
-    ids.iter().map(|id| warp(id)).collect()
+    ids.iter().map(warp).collect()
 }
 
 /// Returns, for every image of `ids`, the list of the splits to which the image belongs: usually one split, none for an
 /// image that is not used. `val` lists the test images and `train` the training images. If `val` is empty, the index of
 /// an image decides (see the module documentation).
-fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
+fn splits(ids: &[String], val: &[String], train: &[String]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);
         let held_out = |at: usize| at % TRAIN_EVERY == TRAIN_EVERY / 2 && at / TRAIN_EVERY + 1 < trained;
@@ -135,22 +108,21 @@ fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Spl
         };
         return (0..ids.len()).map(split).collect();
     }
-    let set = |names: &'_ [Box<str>]| -> HashSet<Box<str>> { names.iter().cloned().collect() };
-    let (train, val) = (set(train), set(val));
-    let split = |id: &str| {
+    let (train, val): (HashSet<&String>, HashSet<&String>) = (train.iter().collect(), val.iter().collect());
+    let split = |id: &String| {
         let is_in = [(Split::Train, train.contains(id)), (Split::Test, val.contains(id))];
         is_in.into_iter().filter(|(_, is_in)| *is_in).map(|(split, _)| split).collect()
     };
-    ids.iter().map(|id| split(id)).collect()
+    ids.iter().map(split).collect()
 }
 
 /// Reads the camera of the image called `id`. The image size in pixels comes from `--resolution`, else from the image
 /// file, else it is half the size stated in the camera file.
 fn listed_image(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
     let file = folder.join("camera").join(format!("{id}.json"));
-    let document = read_keys(&file, &CAMERA_KEYS)?;
-    let own = CameraFields::new(&file, None, &document)?;
-    let [width, height] = own.sides("image_size")?;
+    let text = read_text(&file, MAX_CAMERA_BYTES)?;
+    let own = CameraFields::new(&file, None, &text)?;
+    let (width, height) = own.sides("image_size")?;
     let image = folder.join("rgb/2x").join(format!("{id}.png"));
     let size = options.size.or_else(|| measure(&image)).unwrap_or(((width / 2).max(1), (height / 2).max(1)));
     let focal = own.number("focal_length")?;
@@ -158,7 +130,7 @@ fn listed_image(folder: &Path, id: &str, options: &CameraOptions) -> Result<List
     let intrinsics = [focal * x, focal * y, 0.5 * f64::from(size.0), 0.5 * f64::from(size.1)];
     let orientation = own.matrix3("orientation")?;
     Ok(ListedImage {
-        camera: from_camera_to_world(size, intrinsics, orientation.transpose(), own.vector("position")?.into()),
+        camera: from_camera_to_world(size, intrinsics, orientation.transpose(), own.vector("position")?),
         time: None,
         split: Split::Train,
         image: Some(image),

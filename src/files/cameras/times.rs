@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use hashbrown::HashMap;
 
-use super::assemble::MemoryCounter;
+use super::memory::MemoryCounter;
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::text::TextLines;

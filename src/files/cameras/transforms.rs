@@ -17,21 +17,17 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use hashbrown::HashMap;
 
-use super::assemble::{ListedImage, MemoryCounter, RigBuilder, from_camera_to_world, view_in_name};
-use super::fields::CameraFields;
-use super::image_list::{INTRINSIC_KEYS, each_image, outline};
+use super::assemble::{ListedImage, RigBuilder, from_camera_to_world, view_in_name};
+use super::fields::{CameraFields, read_camera_text};
+use super::memory::MemoryCounter;
 use super::{CameraOptions, TimeConvention};
-use crate::error::{Error, Result, ShowPath};
+use crate::error::{Result, ShowPath};
 use crate::files::image::measure;
-use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
 /// Rotation from OpenGL camera axes (x right, y up, z backward) to OpenCV axes (x right, y down, z forward).
 const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-
-/// Keys that are read from the entry of an image in `transforms*.json` besides [`INTRINSIC_KEYS`].
-const IMAGE_KEYS: [&str; 3] = ["file_path", "transform_matrix", "time"];
 
 /// Lists of image names by which Nerfstudio divides the images of a file into splits. An image in several lists belongs
 /// to the split of the last of them, an image in none to the split of the file.
@@ -52,17 +48,17 @@ const MAX_SHIFT_PX: f64 = 1.0;
 /// other splits may lie beside it. If `with_others` is true (the user named the folder), their cameras are read, too.
 /// If it is false, these files only contribute to the largest time, by which all times are divided.
 pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> Result<Rig> {
+    let mut builder = RigBuilder::new(options.memory);
     let mut files = vec![file.to_owned()];
     let mut latest = 0.0;
     for other in others(file) {
         if with_others {
             files.push(other);
         } else {
-            latest = latest_in(&other)?.max(latest);
+            latest = latest_in(&other, builder.memory_counter())?.max(latest);
         }
     }
     files.sort_by_key(|file| split_of(file) as u8);
-    let mut builder = RigBuilder::new(options.memory);
     let mut shift = 0.0;
     for file in &files {
         shift = add_file(&mut builder, file, options)?.max(shift);
@@ -102,48 +98,43 @@ fn others(file: &Path) -> Vec<PathBuf> {
 }
 
 /// Returns the largest time stamp of the images that `file` lists, at least 0. Values that are not finite numbers are
-/// ignored without an error.
-fn latest_in(file: &Path) -> Result<f64> {
-    let mut latest = 0.0;
-    each_image(file, Some("frames"), &["time"], |_, frame| {
-        let time = frame.get("time").and_then(SmallValue::as_f64).filter(|time| time.is_finite());
-        latest = time.map_or(latest, |time| time.max(latest));
-        Ok(())
-    })?;
+/// ignored without an error. `counter` limits the memory.
+fn latest_in(file: &Path, counter: &mut MemoryCounter) -> Result<f64> {
+    let text = read_camera_text(file, counter)?;
+    let mut latest: f64 = 0.0;
+    for image in CameraFields::new(file, None, &text)?.list("frames", counter)? {
+        let time = CameraFields::new(file, None, image.get()).and_then(|image| image.optional_number("time"));
+        latest = latest.max(time.ok().flatten().unwrap_or(0.0));
+    }
     Ok(latest)
 }
 
 /// Adds the images listed in `file` to `builder`. Returns the largest shift of a corner of an image by lens distortion,
 /// pixels.
 fn add_file(builder: &mut RigBuilder, file: &Path, options: &CameraOptions) -> Result<f64> {
-    let outline = outline(file)?;
-    let shared = CameraFields::new(file, None, &outline)?;
-    builder.begin_file(file, shared.list_len("frames")?)?;
-    let splits = listed_splits(file, &outline, builder.memory_counter())?;
+    let counter = builder.memory_counter();
+    let text = read_camera_text(file, counter)?;
+    let shared = CameraFields::new(file, None, &text)?;
+    let images = shared.list("frames", counter)?;
+    let splits = listed_splits(&shared, counter)?;
+    builder.begin_file(file, images.len())?;
     let mut largest: f64 = 0.0;
-    each_image(file, Some("frames"), &[&IMAGE_KEYS[..], &INTRINSIC_KEYS].concat(), |index, frame| {
-        let fields = CameraFields::new(file, Some(index), frame)?;
-        let (image, shift) = listed_image(file, shared, fields, &splits, options)?;
+    for (index, image) in images.into_iter().enumerate() {
+        let fields = CameraFields::new(file, Some(index), image.get())?;
+        let (image, shift) = listed_image(file, &shared, &fields, &splits, options)?;
         largest = largest.max(shift);
-        builder.add(image)
-    })?;
+        builder.add(image)?;
+    }
     Ok(largest)
 }
 
-/// Reads the lists of splits ([`SPLIT_LISTS`]) in `file`. Returns the split of each image that they name. `outline` is
-/// the file without its images; `counter` limits the memory.
-fn listed_splits(file: &Path, outline: &SmallValue, counter: &mut MemoryCounter) -> Result<HashMap<String, Split>> {
+/// Returns the split of each image that the lists of splits ([`SPLIT_LISTS`]) of a file name. `shared` are the keys of
+/// the file; `counter` limits the memory.
+fn listed_splits(shared: &CameraFields<'_>, counter: &mut MemoryCounter) -> Result<HashMap<String, Split>> {
     let mut splits = HashMap::new();
-    for (key, split) in SPLIT_LISTS.into_iter().filter(|(key, _)| outline.get(key).is_some()) {
-        each_image(file, Some(key), &[], |index, name| {
-            let place = format!("key \"{key}\", element {index}");
-            let SmallValue::Text(name) = name else {
-                return Err(Error::input(file, place, "the name of an image", name.describe()));
-            };
-            counter.take(file, &place, "the lists of splits", name.len() as u64 + SPLIT_ENTRY_BYTES)?;
-            splits.insert(relative(name).to_owned(), split);
-            Ok(())
-        })?;
+    for (key, split) in SPLIT_LISTS.into_iter().filter(|(key, _)| shared.has(key)) {
+        let names = shared.texts(key, SPLIT_ENTRY_BYTES, counter)?;
+        splits.extend(names.into_iter().map(|name| (relative(&name).to_owned(), split)));
     }
     Ok(splits)
 }
@@ -158,12 +149,13 @@ fn relative(name: &str) -> &str {
 /// pixels. Fails if the camera is invalid or a fisheye camera.
 fn listed_image(
     file: &Path,
-    shared: CameraFields<'_>,
-    image_fields: CameraFields<'_>,
+    shared: &CameraFields<'_>,
+    image_fields: &CameraFields<'_>,
     splits: &HashMap<String, Split>,
     options: &CameraOptions,
 ) -> Result<(ListedImage, f64)> {
     let name = image_fields.optional_text("file_path")?;
+    let name = name.as_deref();
     let image = name.map(|name| resolve(file, name));
     let size = size(shared, image_fields, image.as_deref(), options)?;
     let intrinsics = intrinsics(shared, image_fields, size)?;
@@ -184,8 +176,8 @@ fn listed_image(
 /// options. In the camera file, the keys `image_fields` of the image take precedence over the keys `shared` by all
 /// images. Fails if no size is found.
 fn size(
-    shared: CameraFields<'_>,
-    image_fields: CameraFields<'_>,
+    shared: &CameraFields<'_>,
+    image_fields: &CameraFields<'_>,
     image: Option<&Path>,
     options: &CameraOptions,
 ) -> Result<(u32, u32)> {
@@ -208,12 +200,12 @@ fn size(
 /// `image_fields` of the image take precedence over the keys `shared` by all images. Fails if there is no horizontal
 /// focal length.
 fn intrinsics(
-    shared: CameraFields<'_>,
-    image_fields: CameraFields<'_>,
+    shared: &CameraFields<'_>,
+    image_fields: &CameraFields<'_>,
     (width, height): (u32, u32),
 ) -> Result<[f64; 4]> {
     let (width, height) = (f64::from(width), f64::from(height));
-    let focal = |fields: CameraFields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
+    let focal = |fields: &CameraFields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
         if let Some(focal) = fields.optional_number(pixels)? {
             return Ok(Some(focal));
         }
@@ -240,8 +232,8 @@ fn intrinsics(
 /// take precedence over the keys `shared` by all images. Fails for fisheye cameras and other cameras that no pinhole
 /// camera approximates.
 fn lens_shift(
-    shared: CameraFields<'_>,
-    image_fields: CameraFields<'_>,
+    shared: &CameraFields<'_>,
+    image_fields: &CameraFields<'_>,
     (width, height): (u32, u32),
     [fx, fy, cx, cy]: [f64; 4],
 ) -> Result<f64> {
@@ -249,7 +241,7 @@ fn lens_shift(
     const ADVICE: &str = "undistort the images, and export their cameras again";
     for fields in [image_fields, shared] {
         if let Some(model) = fields.optional_text("camera_model")? {
-            if !PERSPECTIVE_MODELS.contains(&model) {
+            if !PERSPECTIVE_MODELS.contains(&&*model) {
                 return Err(fields.wrong("camera_model", EXPECTED).hint(ADVICE));
             }
             break;

@@ -7,18 +7,14 @@
 //! output bytes depend only on the content, because all files in the zip archive are dated 1980-01-01.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::ops::Range;
 use std::path::Path;
-
-use zip::write::FileOptions;
-use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use crate::error::{Error, Result};
 use crate::files::checkpoint;
 use crate::files::checkpoint::{Checkpoint, NodeId, Pickle, TensorView};
-use crate::files::zip_output::ZipOutput;
+use crate::files::zip_output::{create_zip, finish_zip, stored_file_options};
 
 /// Alignment of the contents of each file in the archive, in bytes, as in PyTorch.
 const ALIGNMENT: u16 = 64;
@@ -95,8 +91,7 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
         }
     }
     let failed = |error| Error::io("write", path)(error);
-    let mut archive =
-        ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path).map_err(Error::io("create", path))?)));
+    let mut archive = create_zip(path)?;
     checkpoint.files(|name, what, bytes| {
         let bytes = match what {
             checkpoint::CheckpointFile::Pickle => {
@@ -114,14 +109,11 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
             },
             checkpoint::CheckpointFile::Other => bytes,
         };
-        let options = FileOptions::default()
-            .compression_method(CompressionMethod::Stored)
-            .last_modified_time(DateTime::default())
-            .large_file(bytes.len() as u64 > u64::from(u32::MAX));
+        let options = stored_file_options(bytes.len() as u64);
         archive.start_file_aligned(name, options, ALIGNMENT).map_err(|error| failed(error.into()))?;
         archive.write_all(&bytes).map_err(failed)
     })?;
-    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
+    finish_zip(archive, path)
 }
 
 impl<'a> StoragePart<'a> {

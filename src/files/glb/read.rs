@@ -1,14 +1,14 @@
 //! Reader of `.glb` files with one primitive of the extension `KHR_gaussian_splatting`.
 
-use std::marker::PhantomData;
 use std::path::Path;
 
 use serde_json::Value;
 
 use super::{AXIS_SIGNS, BINARY, EXTENSION, JSON, MAGIC, VERSION, sh_attribute};
 use crate::error::{Error, Result, quoted};
-use crate::files::json::{ParseAbort, read_from};
+use crate::files::json;
 use crate::files::map::FileMap;
+use crate::files::text::decode_text;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, MAX_SH_DEGREE, logit, sh_coefficient_count};
 
@@ -70,7 +70,7 @@ fn component_bytes(component: u64) -> Option<usize> {
 pub fn read_glb(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let map = FileMap::open(path)?;
     let (text, binary) = chunks(&map, path)?;
-    let document = read_from(text, path, &ParseAbort::default(), PhantomData::<Value>)?;
+    let document: Value = json::parse(decode_text(path, text)?, path)?;
     let (mesh, primitive) = find_primitive(&document, path)?;
     let axes = axes_of(&document, mesh, path)?;
     let extension = &primitive["extensions"][EXTENSION];

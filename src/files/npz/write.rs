@@ -5,19 +5,14 @@
 //! Memory: the values of one frame. The output bytes depend only on the content, because all files in the archive are
 //! dated 1980-01-01.
 
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
-use zip::write::FileOptions;
-use zip::{CompressionMethod, DateTime, ZipWriter};
+use zip::CompressionMethod;
 
 use crate::error::{Error, Result};
 use crate::files::npz::{Npz, NpzArray};
-use crate::files::zip_output::ZipOutput;
-
-/// Size in bytes from which a file in a zip archive needs 64-bit lengths.
-const ZIP64_BYTES: usize = 1 << 32;
+use crate::files::zip_output::{create_zip, finish_zip, stored_file_options};
 
 /// Axis of an array that counts the Gaussians: index i along this axis belongs to Gaussian i.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,8 +43,7 @@ pub(crate) fn write_like(
     path: &Path,
 ) -> Result<()> {
     let failed = |error| Error::io("write", path)(error);
-    let mut archive =
-        ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path).map_err(Error::io("create", path))?)));
+    let mut archive = create_zip(path)?;
     for entry in template.entries() {
         let axis = axis(entry);
         let mut shape = entry.shape.clone();
@@ -59,10 +53,8 @@ pub(crate) fn write_like(
             GaussianAxis::Axis1 => shape[1] = kept.len(),
         }
         let method = if entry.is_compressed { CompressionMethod::Deflated } else { CompressionMethod::Stored };
-        let options = FileOptions::default()
-            .compression_method(method)
-            .last_modified_time(DateTime::default())
-            .large_file(entry.len().saturating_mul(8) >= ZIP64_BYTES);
+        // A value has at most 8 bytes.
+        let options = stored_file_options(8 * entry.len() as u64).compression_method(method);
         archive.start_file(format!("{}.npy", entry.name), options).map_err(|error| failed(error.into()))?;
         template.read(entry, |values| {
             if axis == GaussianAxis::None {
@@ -104,7 +96,7 @@ pub(crate) fn write_like(
             Ok(())
         })?;
     }
-    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
+    finish_zip(archive, path)
 }
 
 /// Returns the header of a NumPy array file for values of the type `descr` (NumPy's notation) in an array of the shape

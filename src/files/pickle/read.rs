@@ -113,46 +113,22 @@ impl<'a> PickleMachine<'a> {
             b'.' => return self.pop().map(Some),
             b'(' => self.mark(start)?,
             b'0' => drop(self.pop()?),
-            b'1' => {
-                let first = self.unmark()?;
-                self.stack.truncate(first);
-            }
+            b'1' | b't' | b'l' | 0x91 | b'd' | b'e' | 0x90 | b'u' => self.close(instruction, start)?,
             b'c' => self.global(start)?,
             0x93 => self.stack_global(start)?,
             b')' => self.push(Node::Tuple(Vec::new()), 1)?,
             b']' | 0x8f => self.push(Node::List(Vec::new()), 1)?,
             b'}' => self.push(Node::Dict(Vec::new()), 1)?,
-            b't' => {
-                let first = self.unmark()?;
-                self.collect(first, Node::Tuple)?;
-            }
             0x85..=0x87 => {
                 let first = self.tuple_start(usize::from(instruction - 0x84), start)?;
                 self.collect(first, Node::Tuple)?;
-            }
-            b'l' | 0x91 => {
-                let first = self.unmark()?;
-                self.collect(first, Node::List)?;
-            }
-            b'd' => {
-                let first = self.unmark()?;
-                self.push_below(Node::Dict(Vec::new()), first)?;
-                self.set(start, first + 1)?;
             }
             b'a' => {
                 let first = self.beyond_top(1)?;
                 self.extend(start, first)?;
             }
-            b'e' | 0x90 => {
-                let first = self.unmark()?;
-                self.extend(start, first)?;
-            }
             b's' => {
                 let first = self.beyond_top(2)?;
-                self.set(start, first)?;
-            }
-            b'u' => {
-                let first = self.unmark()?;
                 self.set(start, first)?;
             }
             b'R' | 0x81 => {
@@ -167,26 +143,39 @@ impl<'a> PickleMachine<'a> {
                 let depth = self.container_depth([what])?;
                 self.push(Node::PersistentId(what), depth)?;
             }
-            b'q' => {
-                let [key] = self.take_bytes()?;
-                self.store_in_memo(key.into())?;
-            }
-            b'r' => {
-                let key = u32::from_le_bytes(self.take_bytes()?);
-                self.store_in_memo(key)?;
+            b'q' | b'r' => {
+                let key = self.unsigned(if instruction == b'q' { 1 } else { 4 })?;
+                self.store_in_memo(key as u32)?;
             }
             0x94 => self.store_in_memo(self.memo.len() as u32)?,
-            b'h' => {
-                let [key] = self.take_bytes()?;
-                self.push_from_memo(start, key.into())?;
-            }
-            b'j' => {
-                let key = u32::from_le_bytes(self.take_bytes()?);
-                self.push_from_memo(start, key)?;
+            b'h' | b'j' => {
+                let key = self.unsigned(if instruction == b'h' { 1 } else { 4 })?;
+                self.push_from_memo(start, key as u32)?;
             }
             other => self.step_scalar(other, start)?,
         }
         Ok(None)
+    }
+
+    /// Executes the instruction `instruction`, which began at byte `start`. It uses all values since the last MARK: puts
+    /// them into a new container, adds them to the container below them, or drops them.
+    fn close(&mut self, instruction: u8, start: usize) -> Result<(), PickleError> {
+        let first = self.unmark()?;
+        match instruction {
+            b't' => self.collect(first, Node::Tuple),
+            b'l' | 0x91 => self.collect(first, Node::List),
+            b'd' => {
+                self.push_below(Node::Dict(Vec::new()), first)?;
+                self.set(start, first + 1)
+            }
+            b'e' | 0x90 => self.extend(start, first),
+            b'u' => self.set(start, first),
+            // POP_MARK drops the values.
+            _ => {
+                self.stack.truncate(first);
+                Ok(())
+            }
+        }
     }
 
     /// Returns the index on the stack of the first value of a tuple that takes the top `count` values. Fails if there are
@@ -212,13 +201,9 @@ impl<'a> PickleMachine<'a> {
             b'N' => self.push(Node::None, 0)?,
             0x88 => self.push(Node::Bool(true), 0)?,
             0x89 => self.push(Node::Bool(false), 0)?,
-            b'K' => {
-                let [value] = self.take_bytes()?;
-                self.push_int(value.into(), start)?;
-            }
-            b'M' => {
-                let value = u16::from_le_bytes(self.take_bytes()?);
-                self.push_int(value.into(), start)?;
+            b'K' | b'M' => {
+                let value = self.unsigned(if instruction == b'K' { 1 } else { 2 })?;
+                self.push_int(value as i64, start)?;
             }
             b'J' => {
                 let value = i32::from_le_bytes(self.take_bytes()?);
@@ -430,7 +415,7 @@ impl<'a> PickleMachine<'a> {
     /// The pickle holds the number of bytes of the integer first, which takes `length_bytes` bytes, then the integer.
     /// An integer that does not fit into `i64` becomes [`Node::Opaque`].
     fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), PickleError> {
-        let length = self.length(length_bytes)?;
+        let length = self.unsigned(length_bytes)?;
         let digits = self.take_slice(length)?;
         // Ignore a ninth byte of 0, which only keeps the highest bit of the eighth byte from being taken for a sign.
         let digits = match digits {
@@ -446,8 +431,8 @@ impl<'a> PickleMachine<'a> {
         self.push_int(i64::from_le_bytes(wide), start)
     }
 
-    /// Reads a length that is stored in `bytes` bytes.
-    fn length(&mut self, bytes: usize) -> Result<u64, PickleError> {
+    /// Reads a non-negative integer that is stored in `bytes` bytes, such as a length.
+    fn unsigned(&mut self, bytes: usize) -> Result<u64, PickleError> {
         let mut wide = [0; 8];
         wide[..bytes].copy_from_slice(self.take_slice(bytes as u64)?);
         Ok(u64::from_le_bytes(wide))
@@ -456,7 +441,7 @@ impl<'a> PickleMachine<'a> {
     /// Reads a UTF-8 text and pushes it onto the stack. The pickle holds the length of the text in bytes first, which
     /// takes `length_bytes` bytes, then the text.
     fn text(&mut self, length_bytes: usize) -> Result<(), PickleError> {
-        let length = self.length(length_bytes)?;
+        let length = self.unsigned(length_bytes)?;
         let start = self.at;
         self.take_slice(length)?;
         self.allocations.take(ALLOCATION_BYTES + (self.at - start), start)?;
@@ -468,7 +453,7 @@ impl<'a> PickleMachine<'a> {
     /// Skips a byte string and pushes [`Node::Opaque`] for it. The pickle holds the length of the byte string first,
     /// which takes `length_bytes` bytes, then the bytes.
     fn blob(&mut self, length_bytes: usize) -> Result<(), PickleError> {
-        let length = self.length(length_bytes)?;
+        let length = self.unsigned(length_bytes)?;
         self.take_slice(length)?;
         self.push(Node::Opaque, 0)
     }

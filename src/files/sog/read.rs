@@ -2,7 +2,6 @@
 
 use std::fs::File;
 use std::io::{BufReader, Read};
-use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 use flate2::Crc;
@@ -15,8 +14,9 @@ use super::images::{
 };
 use super::{META_FILE, Meta, PaletteEntry, VERSION};
 use crate::error::{Error, Result, quoted};
-use crate::files::json::{ParseAbort, read_from};
+use crate::files::json;
 use crate::files::open::{open_file, read_small};
+use crate::files::text::decode_text;
 use crate::files::webp::RgbaImage;
 use crate::files::zip_directory::{check_checksum, declared_directory};
 use crate::limits::ReadLimit;
@@ -47,7 +47,7 @@ const MAX_CODEBOOK_VALUE: f32 = 1e30;
 /// # Errors
 /// Fails if the file is damaged, has another version than 2, or needs more memory than `memory`.
 pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
-    let mut files = if path.is_dir() { Files::Folder(path.to_owned()) } else { Files::open_archive(path)? };
+    let mut files = if path.is_dir() { SogFiles::Folder(path.to_owned()) } else { SogFiles::open_archive(path)? };
     let text = files.read(path, META_FILE, ReadLimit::new(MAX_META_BYTES))?;
     decode(&parse(&text, path)?, &mut files, path, memory)
 }
@@ -57,7 +57,7 @@ pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
 ///
 /// # Errors
 /// Fails if an image is missing or damaged, or if more memory than `memory` is needed.
-pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLimit) -> Result<Gaussians> {
+pub(crate) fn decode(meta: &Meta, files: &mut SogFiles, path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let count = meta.count as usize;
     if meta.count > u64::from(u32::MAX) {
         return Err(Error::input(path, "meta.json, count", "at most 4294967295", meta.count.to_string()));
@@ -116,14 +116,14 @@ pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLi
 }
 
 /// Source of the files of a `.sog` archive: the archive itself, or a folder with the same files.
-pub(crate) enum Files {
+pub(crate) enum SogFiles {
     Archive(ZipArchive<BufReader<File>>),
     Folder(PathBuf),
 }
 
-impl Files {
+impl SogFiles {
     /// Opens the ZIP archive at `path`. Fails if the file is no ZIP archive or has too many files.
-    pub(crate) fn open_archive(path: &Path) -> Result<Files> {
+    pub(crate) fn open_archive(path: &Path) -> Result<SogFiles> {
         let damaged = |found: String| {
             Error::input(path, "", "a ZIP archive of images", found)
                 .hint("if the file was copied, copy it again: one that is cut short has lost its list of files")
@@ -133,7 +133,7 @@ impl Files {
         if declared.entries > MAX_ENTRIES || declared.bytes > MAX_LIST_BYTES {
             return Err(damaged(format!("a list of {} files in {} bytes", declared.entries, declared.bytes)));
         }
-        Ok(Files::Archive(ZipArchive::new(file).map_err(|error| damaged(error.to_string()))?))
+        Ok(SogFiles::Archive(ZipArchive::new(file).map_err(|error| damaged(error.to_string()))?))
     }
 
     /// Reads and decodes the image file called `name`. Error messages call the archive `path`. Fails if the image is
@@ -170,7 +170,7 @@ impl Files {
     /// Reads the file called `name`, which may have at most `memory` bytes. Messages call the archive `path`.
     pub(crate) fn read(&mut self, path: &Path, name: &str, memory: ReadLimit) -> Result<Vec<u8>> {
         match self {
-            Files::Archive(archive) => {
+            SogFiles::Archive(archive) => {
                 let refused = |error: String| Error::input(path, name, "a file in the archive", quoted(&error));
                 let mut entry = archive.by_name(name).map_err(|error| refused(error.to_string()))?;
                 memory.check(path, name, "the file", entry.size())?;
@@ -182,7 +182,7 @@ impl Files {
                 check_checksum(path, name, [entry.crc32(), sum.sum()])?;
                 Ok(bytes)
             }
-            Files::Folder(folder) => {
+            SogFiles::Folder(folder) => {
                 if name.is_empty() || name.contains(['/', '\\', ':']) || name.starts_with('.') {
                     return Err(Error::input(path, META_FILE, "names of files in this folder", quoted(name)));
                 }
@@ -194,7 +194,8 @@ impl Files {
 
 /// Parses `text`, the content of `meta.json`. Fails if it is malformed or has another version than 2.
 fn parse(text: &[u8], path: &Path) -> Result<Meta> {
-    let value = read_from(text, &path.join(META_FILE), &ParseAbort::default(), PhantomData::<Value>)?;
+    let meta_path = path.join(META_FILE);
+    let value: Value = json::parse(decode_text(&meta_path, text)?, &meta_path)?;
     if value["version"] != VERSION {
         let found = match &value["version"] {
             Value::Null => "none, as in version 1".to_owned(),

@@ -1,13 +1,10 @@
 //! Writer of `.sog` files.
 
 use std::borrow::Cow;
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
 use serde::Serialize;
-use zip::write::FileOptions;
-use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use super::codebook::Codebook;
 use super::images::{
@@ -20,7 +17,7 @@ use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::{CodingErrors, RenderedAttributes, check_positions};
 use crate::files::webp::RgbaImage;
-use crate::files::zip_output::ZipOutput;
+use crate::files::zip_output::{create_zip, finish_zip, stored_file_options};
 use crate::model::{Gaussians, color_from_sh, opacity};
 
 /// Largest magnitude of ln s that is stored, where s is a scale in scene units. Gaussians with ln s below −20 are
@@ -76,11 +73,9 @@ pub fn write_sog(state: &Gaussians, path: &Path) -> Result<SogErrors> {
 /// Fails if an image is too large or writing fails.
 pub(crate) fn write_archive(path: &Path, images: NamedImages, meta: &impl Serialize) -> Result<()> {
     let failed = |error| Error::io("write", path)(error);
-    let file = File::create(path).map_err(Error::io("create", path))?;
-    let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(file)));
-    let options =
-        FileOptions::default().compression_method(CompressionMethod::Stored).last_modified_time(DateTime::default());
+    let mut archive = create_zip(path)?;
     let mut add = |name: &str, bytes: &[u8]| -> Result<()> {
+        let options = stored_file_options(bytes.len() as u64);
         archive.start_file(name, options).map_err(|error| failed(error.into()))?;
         archive.write_all(bytes).map_err(failed)
     };
@@ -89,7 +84,7 @@ pub(crate) fn write_archive(path: &Path, images: NamedImages, meta: &impl Serial
     }
     let text = serde_json::to_vec(meta).map_err(|error| Error::internal(format!("{META_FILE}: {error}")))?;
     add(META_FILE, &text)?;
-    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
+    finish_zip(archive, path)
 }
 
 /// Returns the Gaussians of `state` without those that a `.sog` file would store with the opacity byte 0, in the same

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Splatv, SplatvGaussian, WORDS_PER_GAUSSIAN};
 use crate::error::{Error, Result};
-use crate::files::defects::Defects;
+use crate::files::defects::{Defect, Defects, KEPT_ZERO_QUATERNION};
 
 /// Treatment of rows (Gaussians) whose quaternion is 0 at every time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -23,16 +23,12 @@ pub enum ZeroRotation {
     Identity,
 }
 
-/// Kind of defect of a row (Gaussian). The elements are its name, whether rows with it are left out, and the reason.
-type Defect = (&'static str, bool, &'static str);
-
 const NON_FINITE_POSITION: Defect = ("NaN or infinite position", true, "no player draws them");
 const INVALID_WIDTH: Defect = ("temporal width of NaN, 0 or less", true, "they are visible at no time");
 const NON_FINITE_VALUE: Defect =
     ("NaN or infinite motion, scale, rotation, rate or center", true, "no player draws them");
 const ZERO_QUATERNION: Defect =
     ("zero quaternion", true, "no player draws them; --zero-rotation identity keeps them without a rotation");
-const KEPT_ZERO_QUATERNION: Defect = ("zero quaternion", false, "taken as the identity, as --zero-rotation asks");
 const INFINITE_WIDTH: Defect =
     ("infinite temporal width", false, "visible at every time, as in players; written as the largest half");
 
@@ -73,8 +69,7 @@ pub fn check_rows(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects
     let mut rows: Option<Vec<u32>> = None;
     for row in 0..count as u32 {
         let row_defects = defects(&SplatvGaussian::from_words(&file.words(row as usize)), zero_rotation);
-        found.add_row(row, &row_defects);
-        match (row_defects.iter().any(|&(_, dropped, _)| dropped), &mut rows) {
+        match (found.add_row(row, &row_defects), &mut rows) {
             // This is the first row that is left out: all rows before it are kept.
             (true, None) => rows = Some((0..row).collect()),
             (false, Some(rows)) => rows.push(row),
@@ -82,10 +77,8 @@ pub fn check_rows(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects
         }
     }
     if count > 0 && found.dropped == count {
-        let kinds: Vec<String> = found.kinds.iter().map(|kind| format!("{} in {}", kind.what, kind.rows)).collect();
-        let error = Error::input(file.path(), "its texture", "rows that a player draws", kinds.join(", "));
-        let is_zero = |kind: &str| kind == ZERO_QUATERNION.0;
-        return Err(match found.kinds.iter().any(|kind| is_zero(&kind.what)) {
+        let error = Error::input(file.path(), "its texture", "rows that a player draws", found.describe_kinds());
+        return Err(match found.kinds.iter().any(|kind| kind.what == ZERO_QUATERNION.0) {
             true => error.hint("--zero-rotation identity keeps rows with a zero quaternion"),
             false => error.hint("the model did not train, or its conversion failed: export it again"),
         });

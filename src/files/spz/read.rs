@@ -38,31 +38,23 @@ struct Header {
     flags: u8,
 }
 
-/// Arrays of an `.spz` file. Each array holds one attribute of all Gaussians.
-#[derive(Default)]
-struct Arrays {
-    positions: Vec<u8>,
-    opacities: Vec<u8>,
-    colors: Vec<u8>,
-    scales: Vec<u8>,
-    rotations: Vec<u8>,
-    harmonics: Vec<u8>,
-}
+/// Number of arrays of an `.spz` file. Each array holds one attribute of all Gaussians.
+const ARRAYS: usize = 6;
 
-impl Arrays {
-    /// Returns the six arrays in the order of the file. Each element is the name of the array, its number of bytes per
-    /// Gaussian for a file with the header `header`, and its content.
-    fn list(&mut self, header: &Header) -> [(&'static str, usize, &mut Vec<u8>); 6] {
-        let rotation = if header.version == 2 { 3 } else { 4 };
-        let harmonics = 3 * (sh_coefficient_count(header.sh_degree) - 1);
+impl Header {
+    /// Returns the arrays of the file in their order. Each element is the name of the array and its number of bytes.
+    fn arrays(&self) -> [(&'static str, usize); ARRAYS] {
+        let rotation = if self.version == 2 { 3 } else { 4 };
+        let harmonics = 3 * (sh_coefficient_count(self.sh_degree) - 1);
         [
-            ("positions", 9, &mut self.positions),
-            ("opacities", 1, &mut self.opacities),
-            ("colors", 3, &mut self.colors),
-            ("scales", 3, &mut self.scales),
-            ("rotations", rotation, &mut self.rotations),
-            ("SH coefficients", harmonics, &mut self.harmonics),
+            ("positions", 9),
+            ("opacities", 1),
+            ("colors", 3),
+            ("scales", 3),
+            ("rotations", rotation),
+            ("SH coefficients", harmonics),
         ]
+        .map(|(name, width)| (name, width * self.count))
     }
 }
 
@@ -119,7 +111,7 @@ fn cut(path: &Path, expected: String, found: usize) -> Error {
 }
 
 /// Reads the header and the arrays of a file of version 2 or 3. `source` returns the decompressed bytes of the file.
-fn read_gzip(mut source: impl Read, path: &Path, memory: ReadLimit) -> Result<(Header, Arrays)> {
+fn read_gzip(mut source: impl Read, path: &Path, memory: ReadLimit) -> Result<(Header, [Vec<u8>; ARRAYS])> {
     let damaged = |error: std::io::Error| {
         Error::input(path, "", "an .spz compressed by gzip", error.to_string())
             .hint("the file is damaged or cut short; copy or export it again")
@@ -130,9 +122,8 @@ fn read_gzip(mut source: impl Read, path: &Path, memory: ReadLimit) -> Result<(H
     if header.version == 4 {
         return Err(Error::input(path, "byte 4, version", "2 or 3 in a gzip file", "4"));
     }
-    let mut arrays = Arrays::default();
-    for (name, width, array) in arrays.list(&header) {
-        let bytes = width * header.count;
+    let mut arrays = <[Vec<u8>; ARRAYS]>::default();
+    for (array, (name, bytes)) in arrays.iter_mut().zip(header.arrays()) {
         source.by_ref().take(bytes as u64).read_to_end(array).map_err(damaged)?;
         if array.len() < bytes {
             return Err(cut(path, format!("{bytes} bytes of {name}"), array.len()));
@@ -155,7 +146,7 @@ fn read_streams(
     length: u64,
     path: &Path,
     memory: ReadLimit,
-) -> Result<(Header, Arrays)> {
+) -> Result<(Header, [Vec<u8>; ARRAYS])> {
     let header = parse_header(head, path, memory)?;
     if header.version != 4 {
         let expected = format!("a file compressed by gzip, as version {} is", header.version);
@@ -168,9 +159,8 @@ fn read_streams(
     if !(HEADER_BYTES_4 as u64..=HEADER_BYTES_4 as u64 + MAX_EXTENSION_BYTES).contains(&table_at) {
         return Err(Error::input(path, "byte 16, offset of the table", "32 to 1048608", table_at.to_string()));
     }
-    let mut arrays = Arrays::default();
-    let listed = arrays.list(&header).into_iter().filter(|(_, width, _)| width * header.count > 0);
-    let listed: Vec<_> = listed.collect();
+    let mut arrays = <[Vec<u8>; ARRAYS]>::default();
+    let listed: Vec<_> = arrays.iter_mut().zip(header.arrays()).filter(|(_, (_, bytes))| *bytes > 0).collect();
     if usize::from(head[15]) != listed.len() {
         return Err(Error::input(path, "byte 15, number of streams", listed.len().to_string(), head[15].to_string()));
     }
@@ -189,8 +179,7 @@ fn read_streams(
         return Err(Error::input(path, "", expected + ", the sum of its parts", format!("{length} bytes"))
             .hint("the file is cut short or damaged; copy or export it again"));
     }
-    for ((name, width, array), [stored, size]) in listed.into_iter().zip(sizes) {
-        let expected = width * header.count;
+    for ((array, (name, expected)), [stored, size]) in listed.into_iter().zip(sizes) {
         if size != expected as u64 {
             return Err(Error::input(path, name, format!("{expected} bytes"), size.to_string()));
         }
@@ -208,7 +197,8 @@ fn read_streams(
 }
 
 /// Decodes the Gaussians in the arrays of a file with the header `header`.
-fn decode(header: &Header, arrays: &Arrays) -> Gaussians {
+fn decode(header: &Header, arrays: &[Vec<u8>; ARRAYS]) -> Gaussians {
+    let [positions, opacities, colors, scales, rotations, harmonics] = arrays;
     let degree = header.sh_degree.min(MAX_SH_DEGREE);
     let mut gaussians = Gaussians::zeros(header.count, degree);
     let unit = 0.5f64.powi(header.bits);
@@ -216,24 +206,24 @@ fn decode(header: &Header, arrays: &Arrays) -> Gaussians {
     let reversed = [1.0, -1.0, -1.0];
     for i in 0..header.count {
         let position: [f32; 3] = std::array::from_fn(|axis| {
-            let bytes = &arrays.positions[9 * i + 3 * axis..][..3];
+            let bytes = &positions[9 * i + 3 * axis..][..3];
             // The sign is in the highest of the three bytes.
             let fixed = i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]) >> 8;
             (reversed[axis] * f64::from(fixed) * unit) as f32
         });
         gaussians.position.set_row(i, position);
-        gaussians.opacity_logit.set_row(i, [decode_opacity(arrays.opacities[i])]);
+        gaussians.opacity_logit.set_row(i, [decode_opacity(opacities[i])]);
         let byte = |array: &[u8], k: usize| f64::from(array[3 * i + k]);
-        gaussians.log_scale.set_row(i, [0, 1, 2].map(|axis| (byte(&arrays.scales, axis) / 16.0 - 10.0) as f32));
+        gaussians.log_scale.set_row(i, [0, 1, 2].map(|axis| (byte(scales, axis) / 16.0 - 10.0) as f32));
         let [x, y, z, w] = match header.version {
-            2 => rotation_of_3_bytes(&arrays.rotations[3 * i..][..3]),
-            _ => rotation_of_4_bytes(&arrays.rotations[4 * i..][..4]),
+            2 => rotation_of_3_bytes(&rotations[3 * i..][..3]),
+            _ => rotation_of_4_bytes(&rotations[4 * i..][..4]),
         };
         gaussians.rotation.set_row(i, [w, x, -y, -z].map(|x| x as f32));
         for c in 0..3 {
-            gaussians.sh.plane_mut(c)[i] = ((byte(&arrays.colors, c) / 255.0 - 0.5) / 0.15) as f32;
+            gaussians.sh.plane_mut(c)[i] = ((byte(colors, c) / 255.0 - 0.5) / 0.15) as f32;
         }
-        let harmonics = &arrays.harmonics[3 * stored_coefficients * i..][..3 * stored_coefficients];
+        let harmonics = &harmonics[3 * stored_coefficients * i..][..3 * stored_coefficients];
         for (k, (rgb, sign)) in
             harmonics.as_chunks::<3>().0.iter().zip(AXIS_SIGNS).take(sh_coefficient_count(degree) - 1).enumerate()
         {

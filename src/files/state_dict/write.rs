@@ -4,17 +4,15 @@
 //! Input: tensors in the layout to be stored. Output: a file of version 3 of PyTorch's zip format, which `torch.load`
 //! opens, with or without `weights_only`. Memory: the pickle. Source: the files that PyTorch 1.6 and later writes.
 
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
 use half::f16;
 use half::slice::HalfFloatSliceExt;
-use zip::write::FileOptions;
-use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use crate::error::{Error, Result};
-use crate::files::zip_output::ZipOutput;
+use crate::files::pickle::int;
+use crate::files::zip_output::{create_zip, finish_zip, stored_file_options};
 
 /// Alignment in bytes of the values of each tensor in the file, as in files that PyTorch writes.
 const ALIGNMENT: u16 = 64;
@@ -94,29 +92,22 @@ impl StoredTensor {
 /// # Errors
 /// Fails if the file cannot be written.
 pub(crate) fn write_state_dict(path: &Path, tensors: &[StoredTensor]) -> Result<()> {
-    let write = || {
-        let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path)?)));
-        // Write the pickle first, and all files into one folder: readers find the other files by the folder of the
-        // pickle.
-        add(&mut archive, "data.pkl", &pickle(tensors))?;
-        add(&mut archive, "byteorder", if cfg!(target_endian = "big") { b"big" } else { b"little" })?;
-        for (key, tensor) in tensors.iter().enumerate() {
-            add(&mut archive, &format!("data/{key}"), tensor.values.bytes())?;
-        }
-        add(&mut archive, "version", b"3\n")?;
-        archive.finish()?.close()
+    let failed = |error| Error::io("write", path)(error);
+    let mut archive = create_zip(path)?;
+    let mut add = |name: &str, bytes: &[u8]| -> Result<()> {
+        let options = stored_file_options(bytes.len() as u64);
+        let begun = archive.start_file_aligned(format!("archive/{name}"), options, ALIGNMENT);
+        begun.map_err(|error| failed(error.into()))?;
+        archive.write_all(bytes).map_err(failed)
     };
-    write().map_err(Error::io("write", path))
-}
-
-/// Adds an uncompressed file `name` to the archive, with its content aligned to 64 bytes.
-fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &[u8]) -> io::Result<()> {
-    let options = FileOptions::default()
-        .compression_method(CompressionMethod::Stored)
-        .last_modified_time(DateTime::default())
-        .large_file(bytes.len() as u64 > u64::from(u32::MAX));
-    archive.start_file_aligned(format!("archive/{name}"), options, ALIGNMENT)?;
-    archive.write_all(bytes)
+    // Write the pickle first, and all files into one folder: readers find the other files by the folder of the pickle.
+    add("data.pkl", &pickle(tensors))?;
+    add("byteorder", if cfg!(target_endian = "big") { b"big" } else { b"little" })?;
+    for (key, tensor) in tensors.iter().enumerate() {
+        add(&format!("data/{key}"), tensor.values.bytes())?;
+    }
+    add("version", b"3\n")?;
+    finish_zip(archive, path)
 }
 
 /// Returns the pickle (protocol 2) of an ordered dictionary that maps names to tensors. The pickle refers to the values
@@ -133,12 +124,12 @@ fn pickle(tensors: &[StoredTensor]) -> Vec<u8> {
         out.extend(format!("ctorch\n{}\n", tensor.values.class()).bytes());
         text(&mut out, &key.to_string());
         text(&mut out, "cpu");
-        number(&mut out, tensor.values.len());
+        out.extend(int(tensor.values.len() as u64));
         out.extend(b"tQ");
-        number(&mut out, tensor.offset);
+        out.extend(int(tensor.offset as u64));
         for extents in [&tensor.shape, &tensor.stride] {
             out.extend(b"(");
-            extents.iter().for_each(|&extent| number(&mut out, extent));
+            extents.iter().for_each(|&extent| out.extend(int(extent as u64)));
             out.extend(b"t");
         }
         // The tensor's `requires_grad` is false, and it has no hooks.
@@ -153,24 +144,6 @@ fn text(out: &mut Vec<u8>, text: &str) {
     out.push(b'X');
     out.extend((text.len() as u32).to_le_bytes());
     out.extend(text.bytes());
-}
-
-/// Appends the whole number `number` to the pickle `out` in the shortest form.
-fn number(out: &mut Vec<u8>, number: usize) {
-    match number {
-        0..=0xFF => out.extend([b'K', number as u8]),
-        0x100..=0xFFFF => out.extend([b'M', number as u8, (number >> 8) as u8]),
-        0x1_0000..=0x7FFF_FFFF => {
-            out.push(b'J');
-            out.extend((number as i32).to_le_bytes());
-        }
-        // Write nine bytes, of which the last is 0, so that the number is not negative.
-        _ => {
-            out.extend([0x8A, 9]);
-            out.extend((number as u64).to_le_bytes());
-            out.push(0);
-        }
-    }
 }
 
 #[cfg(test)]
@@ -295,9 +268,7 @@ mod tests {
             b"u.",
         ];
         assert_eq!(pickle(&[tensor]), expected.concat());
-        let mut large = Vec::new();
-        number(&mut large, 1 << 31);
-        assert_eq!(large, [0x8A, 9, 0, 0, 0, 0x80, 0, 0, 0, 0, 0]);
+        assert_eq!(int(1 << 31), [0x8A, 9, 0, 0, 0, 0x80, 0, 0, 0, 0, 0]);
     }
 
     #[test]

@@ -1,6 +1,5 @@
 //! Reader of `.tsog` files.
 
-use std::marker::PhantomData;
 use std::path::Path;
 
 use serde_json::Value;
@@ -9,10 +8,11 @@ use super::write::MAX_FRAMES;
 use super::{DEFAULT_FRAMES, TimedGaussians, Timeline, TimelineEntry, TsogMeta, VERSION, Velocity, codes_per_frame};
 use crate::error::{Error, Result, quoted};
 use crate::files::ftgs::{ClipTimes, FRAME_RATE, LOG_TIME_DEVIATION, TIME_CENTER, VELOCITY};
-use crate::files::json::{ParseAbort, read_from};
+use crate::files::json;
 use crate::files::sog::META_FILE;
 use crate::files::sog::images::{Range3, decode_16_bit};
-use crate::files::sog::read::{Files, decode};
+use crate::files::sog::read::{SogFiles, decode};
+use crate::files::text::decode_text;
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, StoredParams};
 
@@ -28,8 +28,8 @@ const MAX_PLAYBACK: f64 = 1e6;
 /// Returns whether the file at `path` is a ZIP archive with a `meta.json` of version 4.
 pub fn is_tsog(path: &Path) -> bool {
     let meta = || -> Result<Value> {
-        let text = Files::open_archive(path)?.read(path, META_FILE, ReadLimit::new(MAX_META_BYTES))?;
-        read_from(&text[..], path, &ParseAbort::default(), PhantomData::<Value>)
+        let text = SogFiles::open_archive(path)?.read(path, META_FILE, ReadLimit::new(MAX_META_BYTES))?;
+        json::parse(decode_text(path, &text)?, path)
     };
     meta().is_ok_and(|meta| meta["version"] == VERSION)
 }
@@ -40,7 +40,7 @@ pub fn is_tsog(path: &Path) -> bool {
 /// # Errors
 /// Fails if the file is damaged, has another version than 4, or needs more memory than `memory`.
 pub fn read_tsog(path: &Path, memory: ReadLimit) -> Result<TimedGaussians> {
-    let mut files = Files::open_archive(path)?;
+    let mut files = SogFiles::open_archive(path)?;
     let text = files.read(path, META_FILE, ReadLimit::new(memory.bytes().min(MAX_META_BYTES)))?;
     let meta = parse(&text, path)?;
     if !(1..=u64::from(u32::MAX)).contains(&meta.sog.count) {
@@ -77,7 +77,8 @@ pub fn read_tsog(path: &Path, memory: ReadLimit) -> Result<TimedGaussians> {
 /// Parses `text`, the content of `meta.json`. Fails if it is malformed, has another version than 4, or has a null in
 /// place of an optional member.
 fn parse(text: &[u8], path: &Path) -> Result<TsogMeta> {
-    let value = read_from(text, &path.join(META_FILE), &ParseAbort::default(), PhantomData::<Value>)?;
+    let meta_path = path.join(META_FILE);
+    let value: Value = json::parse(decode_text(&meta_path, text)?, &meta_path)?;
     if value["version"] != VERSION {
         let found = quoted(&value["version"].to_string()).to_string();
         return Err(Error::input(path, "meta.json, version", VERSION.to_string(), found));
@@ -115,7 +116,7 @@ fn frame_count(entry: &TimelineEntry, path: &Path) -> Result<usize> {
 fn read_timeline(
     entry: &TimelineEntry,
     timeline: Timeline,
-    files: &mut Files,
+    files: &mut SogFiles,
     (path, memory): (&Path, ReadLimit),
     format_specific: &mut AttributeValues,
 ) -> Result<()> {
@@ -150,7 +151,7 @@ fn read_timeline(
 /// and `memory` limits the size of the images.
 fn read_velocities(
     entry: &Velocity,
-    files: &mut Files,
+    files: &mut SogFiles,
     (path, memory): (&Path, ReadLimit),
     format_specific: &mut AttributeValues,
 ) -> Result<()> {

@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 
 use crate::archive::{
-    self, ATTRIBUTES, ArchiveContent, Column, FIRST_SH_ATTRIBUTE, QuantizationSteps, STEP_NUMBERS, TensorRole,
-    TensorSteps,
+    self, ATTRIBUTES, ArchiveContent, Column, FIRST_SH_ATTRIBUTE, QuantizationSteps, TensorRole, TensorSteps,
+    nearest_step_number,
 };
 use crate::error::Result;
 use crate::pipeline::stages::reference_views::{ReferenceViews, step_change};
@@ -21,15 +21,17 @@ const MAX_STEP: f64 = 4.0;
 /// of f32.
 const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 
-/// Group of values that share one quantization step: an attribute (by index), a further column of the Gaussians or a
-/// tensor of the deformation field (by name).
+/// Group of values that share one quantization step.
 #[derive(Debug, Clone)]
 pub(super) enum ValueGroup {
+    /// Attribute, by its index in [`ATTRIBUTES`].
     Attribute(usize),
-    /// Column, by index and name. If the column holds the later frames of an attribute, the group also contains this
-    /// attribute (by index), which holds the first frame. Otherwise the step of the first frame could become far too
-    /// coarse, because no render that measures errors may show the first frame.
+    /// Further column of the Gaussians: its index, its name, and the index of an attribute that belongs to the same
+    /// group. A column belongs with an attribute if the attribute holds the values at the first frame and the column
+    /// those at all later frames. With a step of its own, the first frame could become far too coarse: the renders by
+    /// which steps are chosen do not always show it.
     Column(usize, String, Option<usize>),
+    /// Tensor of the deformation field, by name.
     Tensor(String),
 }
 
@@ -56,11 +58,11 @@ impl ValueGroup {
 
 /// Quantization steps of all groups of values (attributes and tensors) in the content of an archive.
 pub(super) struct Grids {
-    /// All groups of values (attributes, columns and tensors) of the content.
+    /// All groups of values of the content.
     pub(super) groups: Vec<ValueGroup>,
-    /// Standard deviation of the values of each group (attribute, column or tensor) in `groups`.
+    /// Standard deviation of the values of each group.
     deviations: Vec<f64>,
-    /// Log2 of the quantization step of each group (attribute, column or tensor) in `groups`.
+    /// Log2 of the quantization step of each group.
     octaves: Vec<f64>,
     /// For each tensor, by name: offsets that are added to the log2 of its quantization step, in eighths of an octave
     /// (doubling). A feature plane has one offset per channel; a matrix has one per row, then one per column; any other
@@ -86,11 +88,11 @@ impl Grids {
         let mut steps = QuantizationSteps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
-                ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step(octave + added),
+                ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step_number(octave + added),
                 ValueGroup::Column(_, _, first_frame) => {
                     // The groups hold the columns in their order.
-                    steps.columns.push(nearest_step(octave + added));
-                    first_frame.iter().for_each(|&k| steps.cloud[k] = nearest_step(octave + added));
+                    steps.columns.push(nearest_step_number(octave + added));
+                    first_frame.iter().for_each(|&k| steps.cloud[k] = nearest_step_number(octave + added));
                 }
                 ValueGroup::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
             }
@@ -99,7 +101,7 @@ impl Grids {
     }
 
     fn tensor(&self, name: &str, octave: f64) -> TensorSteps {
-        TensorSteps { step: nearest_step(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
+        TensorSteps { step: nearest_step_number(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
     }
 
     /// Measures the squared error of renders and the bits that every group of values causes. Then sets the quantization
@@ -154,7 +156,7 @@ impl Grids {
                 ValueGroup::Attribute(k) => {
                     let before = content.cloud.clone();
                     let mut steps = [0; ATTRIBUTES.len()];
-                    steps[*k] = nearest_step(octave);
+                    steps[*k] = nearest_step_number(octave);
                     archive::round_cloud(&mut content.cloud, &steps, &[*k]);
                     let found = reference_views.error(&*scene.input.decode_frames(content)?);
                     content.cloud = before;
@@ -162,7 +164,7 @@ impl Grids {
                 }
                 ValueGroup::Column(k, _, first_frame) => {
                     let before = (content.columns[*k].clone(), first_frame.map(|_| content.cloud.clone()));
-                    let step = nearest_step(octave);
+                    let step = nearest_step_number(octave);
                     archive::round_column(&mut content.columns[*k], step);
                     if let Some(attribute) = first_frame {
                         archive::round_cloud(&mut content.cloud, &[step; ATTRIBUTES.len()], &[*attribute]);
@@ -224,10 +226,4 @@ fn deviation(content: &ArchiveContent, group: &ValueGroup) -> f64 {
         }
     };
     found.max(1e-9)
-}
-
-/// Returns the number k of the quantization step 2^(k/8) that is nearest to 2^`octave`, limited to the valid numbers
-/// [`STEP_NUMBERS`].
-fn nearest_step(octave: f64) -> i32 {
-    ((8.0 * octave).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }

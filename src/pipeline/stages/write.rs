@@ -11,8 +11,7 @@ use crate::TOOL;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{
-    Replace, SUMMARY_FILE, ScratchFolder, StagedFiles, StagedFolder, TargetKind, check_target, check_targets,
-    write_text,
+    Replace, SUMMARY_FILE, ScratchFolder, StagedFile, StagedFolder, TargetKind, check_target, check_targets, write_text,
 };
 use crate::files::names::name_of;
 use crate::files::sog::images::morton_order;
@@ -336,7 +335,7 @@ impl WriteStage {
             staged.commit()?;
             return Ok(summary);
         }
-        let staged = StagedFiles::new(target, self.companions().to_vec(), self.overwrite)?;
+        let staged = StagedFile::with_companions(target, self.companions().to_vec(), self.overwrite)?;
         let [marker, recipe_file, index_map] = [0, 1, 2].map(|index| staged.companion_path(index));
         let size = write(staged.path())?;
         write_text(&recipe_file, recipe)?;

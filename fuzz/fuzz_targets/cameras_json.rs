@@ -1,3 +1,0 @@
-#![no_main]
-
-splatsieve_fuzz::target!("cameras_json");
