@@ -9,11 +9,11 @@ use crate::metrics::{METRIC_BYTES_PER_PIXEL, SSIM_GRADIENT_BYTES_PER_PIXEL, deci
 use crate::passes::pixel_stride;
 use crate::render::Image;
 
-/// Root mean square of the derivatives of the loss of a view after [`equalize_gradient`]: that of a view with 40 dB before
-/// it. Any value serves, because Adam does not depend on a constant factor.
+/// Root mean square of the derivatives of the loss of a view after [`equalize_gradient`]: that of a view with 40 dB
+/// before it. Any value serves, because Adam does not depend on a constant factor.
 const VIEW_GRADIENT: f64 = 0.02;
-/// Minimum root mean square of derivatives that [`equalize_gradient`] scales to [`VIEW_GRADIENT`]: that of a view with 90 dB.
-/// Smaller errors are rounding errors.
+/// Minimum root mean square of derivatives that [`equalize_gradient`] scales to [`VIEW_GRADIENT`]: that of a view with
+/// 90 dB. Smaller errors are rounding errors.
 const MIN_GRADIENT: f64 = 6.3e-5;
 
 /// Factor of the mean square error in the loss. For a render with 35 dB PSNR, the mean square error times this factor
@@ -120,10 +120,10 @@ fn image(render: &Image, target: &[u16]) -> Image {
 }
 
 /// Scales the derivatives `gradient` of the loss of one view with respect to its color values so that their root mean
-/// square is [`VIEW_GRADIENT`]. This makes the loss of a view the root of its mean square error, instead of the mean square
-/// error: views with small errors count as much as views with large errors, of which those from outside the rig are an
-/// example. Derivatives whose root mean square is below [`MIN_GRADIENT`] stay small. Values that are not finite do not
-/// count: the renderer ignores their pixels.
+/// square is [`VIEW_GRADIENT`]. This makes the loss of a view the root of its mean square error, instead of the mean
+/// square error: views with small errors count as much as views with large errors, of which those from outside the rig
+/// are an example. Derivatives whose root mean square is below [`MIN_GRADIENT`] stay small. Values that are not finite
+/// do not count: the renderer ignores their pixels.
 pub(super) fn equalize_gradient(gradient: &mut Image) {
     let squares = gradient.data.iter().map(|&value| f64::from(value).powi(2)).filter(|square| square.is_finite());
     let (sum, count) = squares.fold((0.0, 0u32), |(sum, count), square| (sum + square, count + 1));
