@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::linearized::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
-use super::loss::{Loss, RenderQuality, equalize_gradient};
+use super::loss::{GUARD_WEIGHT, Loss, RenderQuality, equalize_gradient};
 use super::rounding::Rounding;
 use super::step_input::{StepFiles, StepInput};
 use super::targets::Targets;
@@ -478,9 +478,10 @@ impl<'a> OptimizerState<'a> {
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
         let OptimizerState { scene, targets, stride, ref frames, ref linearized, .. } = *self;
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
+        let weight = if targets.is_guard(k) { GUARD_WEIGHT } else { 1.0 };
         let pull = |render: &_| {
             let mut gradient = loss.gradient(render, &target);
-            equalize_gradient(&mut gradient);
+            equalize_gradient(&mut gradient, weight);
             (0.0, gradient)
         };
         let (renderer, view) = (&mut self.renderer, targets.view(k, stride));
