@@ -271,8 +271,6 @@ pub struct Forecast {
     pub core_seconds: EstimateRange,
     /// Number of threads that the run uses.
     pub threads: u64,
-    /// Whether this forecast uses the measured speed of this machine. Always false.
-    pub measured: bool,
     /// Expected peak memory of the process by the memory plan, bytes.
     pub memory_bytes: u64,
     /// Expected processor time of each stage, in the order of the stages.

@@ -25,7 +25,6 @@ impl Forecast {
             seconds: range(core_seconds / (UTILIZATION * work.threads as f64).max(1.0)),
             core_seconds: range(core_seconds),
             threads: work.threads,
-            measured: false,
             memory_bytes,
             stages: needs
                 .iter()
