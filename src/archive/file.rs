@@ -135,8 +135,8 @@ pub(super) struct ArchiveHeader {
 }
 
 impl ArchiveHeader {
-    /// Parses the header of the file at `path`, which has `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more,
-    /// or the whole file if it is shorter.
+    /// Parses the header of the file at `path`, which has `whole` bytes. `head` holds the first
+    /// [`HEADER_BYTES`] bytes of the file or more, or the whole file if it is shorter.
     pub(super) fn parse(path: &Path, head: &[u8], whole: u64) -> Result<ArchiveHeader> {
         if !head.starts_with(&MAGIC) {
             let first = head.get(..8.min(head.len())).unwrap_or_default();
@@ -190,8 +190,8 @@ impl ArchiveHeader {
     }
 }
 
-/// Returns the sections of the archive `bytes`, which was read from `path`, decompressed, and its size by purpose. `head` is its parsed header.
-/// Fails if a checksum or a length is wrong.
+/// Returns the sections of the archive `bytes`, which was read from `path`, decompressed, and its size by purpose. `head`
+/// is its parsed header. Fails if a checksum or a length is wrong.
 pub(super) fn read(path: &Path, head: &ArchiveHeader, bytes: &[u8]) -> Result<(Sections, ArchiveSize)> {
     let mut rest = &bytes[HEADER_BYTES..];
     let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
@@ -220,8 +220,8 @@ pub(super) fn read(path: &Path, head: &ArchiveHeader, bytes: &[u8]) -> Result<(S
 }
 
 /// Checks that `bytes`, the size of the decoded content of the archive at `path`, is not suspiciously large for a file
-/// of `length` bytes. Fails if it exceeds 64 MiB plus 512 bytes per byte of the file. `None` stands for a number that overflowed
-/// and fails as well.
+/// of `length` bytes. Fails if it exceeds 64 MiB plus 512 bytes per byte of the file. `None` stands for a
+/// number that overflowed and fails as well.
 pub(super) fn check_size(path: &Path, bytes: Option<usize>, length: u64) -> Result<()> {
     let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {

@@ -183,8 +183,8 @@ pub fn check_header(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> 
     ArchiveHeader::parse(path, head, whole)?.check_memory(path, memory)
 }
 
-/// Parses the table of contents of the archive at `path`, which has `length` bytes. Fails if its numbers are inconsistent or too large for
-/// a file of this length.
+/// Parses the table of contents of the archive at `path`, which has `length` bytes. Fails if its numbers are
+/// inconsistent or too large for a file of this length.
 fn table(path: &Path, sections: &Sections, length: usize) -> Result<Table> {
     let table: Table = serde_json::from_slice(&sections.table)
         .map_err(|error| damage(path, "table", "a table of this version", error.to_string()))?;

@@ -187,8 +187,8 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
 
 /// Returns the library's options for comparing the renders of two models. The options request no CSV file of the
 /// scores; the caller can add one.
-pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
-    let original = input_options(args.input, Some(args.cameras), None, events);
+pub(super) fn evaluate_options(args: CompareArgs, output: Option<&Path>, events: &Events) -> EvaluateOptions {
+    let original = input_options(args.input, Some(args.cameras), output, events);
     EvaluateOptions {
         original,
         compressed: args.compressed,

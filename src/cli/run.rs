@@ -36,14 +36,13 @@ use splatsieve::report::{self, ReportOptions, trade_off};
 /// # Errors
 /// Fails if the threads cannot be started, if the command fails, or if standard output cannot be written.
 pub(super) fn run(cli: Cli) -> Result<()> {
-    // 0 threads: one for each core.
-    let threads = cli.threads.map_or(0, usize::from);
-    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().map_err(|error| {
-        Error::usage(format!(
-            "cannot start the threads: {error}\n  the system limits the number of threads of this user or job; \
-             --threads 1 needs the fewest"
-        ))
-    })?;
+    let needs_threads = !matches!(
+        cli.command,
+        CommandArgs::Cache(_) | CommandArgs::Recipe(_) | CommandArgs::Completions(_) | CommandArgs::Man(_)
+    );
+    if needs_threads {
+        start_threads(cli.threads)?;
+    }
     let events = Events::new(Display::new(cli.quiet));
     match cli.command {
         CommandArgs::Compress(args) => run_compress(*args, cli.quiet, &events),
@@ -64,6 +63,18 @@ pub(super) fn run(cli: Cli) -> Result<()> {
         CommandArgs::Completions(args) => run_completions(&args),
         CommandArgs::Man(args) => run_man(&args),
     }
+}
+
+/// Starts the threads that all parallel work shares: `threads` of them, or one for each core.
+fn start_threads(threads: Option<u16>) -> Result<()> {
+    // rayon starts one thread for each core if the number is 0.
+    let count = threads.map_or(0, usize::from);
+    rayon::ThreadPoolBuilder::new().num_threads(count).build_global().map_err(|error| {
+        Error::usage(format!(
+            "cannot start the threads: {error}\n  the system limits the number of threads of this user or job; \
+             --threads 1 needs the fewest"
+        ))
+    })
 }
 
 /// Runs the command `compress` and prints its summary. With `--dry-run`, only prints the plan of the run; with
@@ -147,7 +158,7 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
     let mut options = EvaluateOptions {
         csv: args.csv,
         overwrite: replace(args.results.overwrite),
-        ..evaluate_options(args.models, events)
+        ..evaluate_options(args.models, None, events)
     };
     options.original.work = cache_request(args.cache_args);
     let Some(found) = completed(evaluation::evaluate(&options)?)? else { return Ok(()) };
@@ -172,7 +183,7 @@ fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
 /// Runs the command `report` and prints the verdict on each compressed model, the notes, and the path of the page.
 fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     let (as_json, page) = (args.results.json, args.output.join(report::PAGE_FILE));
-    let mut evaluate = evaluate_options(args.models, events);
+    let mut evaluate = evaluate_options(args.models, Some(&args.output), events);
     evaluate.original.work = cache_request(args.cache_args);
     let options = ReportOptions {
         evaluate,

@@ -145,6 +145,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
         cameras: Some(cameras),
         memory: options.memory,
         events: options.events.clone(),
+        scratch: Some(folder.to_owned()),
         ..InputOptions::default()
     };
     view(&ViewOptions {

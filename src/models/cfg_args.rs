@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 use crate::files::names::last_component;
-use crate::files::open::read_small;
 use crate::files::python_literal::{Argument, Literal, parse_call};
+use crate::files::text::read_text;
 
 /// Maximum bytes of a `cfg_args` file, more than any namespace that an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
@@ -18,11 +18,7 @@ pub(super) const SH_DEGREE: &str = "sh_degree";
 /// Returns the text of the `cfg_args` file at `path`. Fails if the file cannot be read, is not UTF-8 text or has more
 /// than [`MAX_BYTES`] bytes.
 pub(super) fn read(path: &Path) -> Result<String> {
-    let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
-    String::from_utf8(bytes).map_err(|error| {
-        let valid = error.utf8_error().valid_up_to();
-        Error::input(path, format!("byte {valid}"), "UTF-8 text", "an invalid byte")
-    })
+    read_text(path, MAX_BYTES)
 }
 
 /// Keys of a `cfg_args` file and their values.

@@ -277,13 +277,15 @@ impl RunPlan {
     }
 
     /// Checks that a run which reads the model `input` and the cameras `cameras` may write its output. Called before the
-    /// input is opened. A folder of cameras may contain the output.
+    /// input is opened.
     ///
     /// # Errors
     /// Fails if the output exists already or cannot be created, or is the input or the camera file.
     pub fn check_target(&self, input: &Path, cameras: Option<&Path>) -> Result<()> {
-        let read: Vec<&Path> = iter::once(input).chain(cameras.filter(|cameras| cameras.is_file())).collect();
-        self.output.as_ref().map_or(Ok(()), |output| output.check_target(&read))
+        let Some(output) = &self.output else { return Ok(()) };
+        // A result in a folder replaces only files of an earlier result, so cameras may lie there.
+        let cameras = cameras.filter(|cameras| cameras.is_file() && !output.kind.is_folder());
+        output.check_target(&iter::once(input).chain(cameras).collect::<Vec<_>>())
     }
 
     /// Checks, before any work, that the stages of the plan can run on the scene: the files that they need must exist,

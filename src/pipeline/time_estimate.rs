@@ -13,14 +13,19 @@ const ERROR_RANGE: [f64; 2] = [0.15, 4.0];
 /// Fraction of the processors that the stages of a run keep busy on average. It is below 1 because some work is not
 /// divided among threads.
 const UTILIZATION: f64 = 0.9;
+/// Time that every run takes at most to start, to open its input and to write its output, seconds.
+const FIXED_SECONDS: f64 = 0.5;
 
 impl Forecast {
     /// Returns the forecast (expected time and memory) of a run. `work`: sizes of its input and views. `needs`:
     /// resource estimates of its stages. `memory_bytes`: maximum memory.
     pub(super) fn new(work: &Workload, needs: &[ResourceEstimate], memory_bytes: u64) -> Forecast {
         let core_seconds: f64 = needs.iter().map(|need| need.seconds).sum();
-        let range =
-            |likely: f64| EstimateRange { least: ERROR_RANGE[0] * likely, likely, most: ERROR_RANGE[1] * likely };
+        let range = |likely: f64| EstimateRange {
+            least: ERROR_RANGE[0] * likely,
+            likely,
+            most: ERROR_RANGE[1] * likely + FIXED_SECONDS,
+        };
         Forecast {
             seconds: range(core_seconds / (UTILIZATION * work.threads as f64).max(1.0)),
             core_seconds: range(core_seconds),

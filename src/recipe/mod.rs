@@ -165,7 +165,7 @@ const NONNEGATIVE: [f64; 2] = [0.0, f64::INFINITY];
 const STEPS: [f64; 2] = [0.0, MAX_STEPS as f64];
 
 /// Ranges of the parameters that are numbers: the table of the recipe, the key in it, and the minimum and maximum.
-const RANGES: [(&str, &str, [f64; 2]); 27] = [
+const RANGES: [(&str, &str, [f64; 2]); 29] = [
     ("scan", "alpha_min", FRACTION),
     ("scan", "outside", FRACTION),
     ("score", "w_static", WEIGHT),
@@ -186,6 +186,8 @@ const RANGES: [(&str, &str, [f64; 2]); 27] = [
     ("merge", "motion_noise", FINITE),
     ("merge", "max_drift", NONNEGATIVE),
     ("merge", "max_dead_time", NONNEGATIVE),
+    ("merge", "max_neighbors", [1.0, 1024.0]),
+    ("bands", "bands_margin", FINITE),
     ("refine", "refine_steps", STEPS),
     ("refine", "refine_steps_per_prune", STEPS),
     ("refine", "refine_archive_steps", STEPS),
@@ -327,5 +329,22 @@ mod tests {
         assert!(message.contains("select.keep_fraction") && message.contains("1.5"), "{message}");
         let message = Recipe::from_toml("[select]\ntau_static = nan\n", "paper").unwrap_err();
         assert!(message.contains("select.tau_static"), "{message}");
+    }
+
+    #[test]
+    fn every_number_has_a_range() {
+        // These are checked by other rules: a fraction of two ranges, and a number whose type is its range.
+        const OTHER: [&str; 2] = ["round_fraction", "scoring_views"];
+        let table = toml::Table::try_from(Recipe::preset("default").unwrap()).unwrap();
+        for (section, values) in &table {
+            for (key, value) in values.as_table().into_iter().flatten() {
+                let is_number = value.is_integer() || value.is_float();
+                let has_range = RANGES.iter().any(|(in_section, name, _)| section == in_section && key == name);
+                assert!(!is_number || has_range || OTHER.contains(&key.as_str()), "{section}.{key}");
+            }
+        }
+        for text in ["[bands]\nbands_margin = -100.0\n", "[merge]\nmax_neighbors = 0\n"] {
+            assert!(Recipe::from_toml(text, "default").is_err(), "{text}");
+        }
     }
 }

@@ -47,7 +47,7 @@ pub(super) struct RenderQuality {
 
 impl Loss {
     /// Returns the derivative of the loss with respect to each color value of `render`, as an image. Derivatives are
-    /// multiplied by the number of color values and by a constant; Adam does not depend on a constant factor. `target`:
+    /// multiplied by a factor, which [`equalize_gradient`] removes. `target`:
     /// color values of the target view, 0 to 1 as 16-bit integers. For values of the render outside [0, 1] the
     /// derivative is 0, because a screen clamps these.
     pub(super) fn gradient(&self, render: &Image, target: &[u16]) -> Image {
@@ -125,8 +125,8 @@ fn image(render: &Image, target: &[u16]) -> Image {
 
 /// Scales the derivatives `gradient` of the loss of one view with respect to its color values so that their root mean
 /// square is `weight` · [`VIEW_GRADIENT`]. This makes the loss of a view `weight` times the root of its mean square
-/// error, instead of the mean square error: views with small errors count as much as views with large errors, of which
-/// those from outside the rig are an example. Derivatives whose root mean square is below [`MIN_GRADIENT`] stay small.
+/// error and the number of its pixels, instead of the mean square error: views with small errors count as much as views
+/// with large errors, of which those from outside the rig are an example. With SSIM in the loss, the scaling is the same. Derivatives whose root mean square is below [`MIN_GRADIENT`] stay small.
 /// Values that are not finite do not count: the renderer ignores their pixels.
 pub(super) fn equalize_gradient(gradient: &mut Image, weight: f64) {
     let squares = gradient.data.iter().map(|&value| f64::from(value).powi(2)).filter(|square| square.is_finite());

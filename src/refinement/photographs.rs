@@ -97,7 +97,7 @@ impl RefineStage {
                 }
                 None => {
                     let why = own.left_out.into_iter().next().map_or_else(String::new, |left| left.why);
-                    journal.leave_out(FIT, why);
+                    journal.leave_out(FIT, format!("against the photographs that were held back, {why}"));
                 }
             }
             Ok((result, count))

@@ -31,7 +31,7 @@ pub(super) fn db(value: f64) -> String {
     format!("{value:.2} dB")
 }
 
-/// Formats a number with at most four significant digits and without trailing zeros, for ticks and bars.
+/// Formats a number with at most four significant digits and without trailing zeros, for ticks of axes.
 pub(super) fn figure(value: f64) -> String {
     let size = value.abs();
     if value == 0.0 || !value.is_finite() {

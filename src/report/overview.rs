@@ -17,7 +17,7 @@ pub(super) fn header(results: &[Analysis], names: &[String]) -> String {
         out += &format!("<p class=\"verdict\">{name}{}</p>\n", escape(&result.data.verdict));
     }
     out += &table(results, names);
-    let has_times = results.iter().any(|result| result.data.render_time.is_some());
+    let has_times = results.iter().all(|result| result.data.render_time.is_some());
     let times = if has_times { " Render times are per view, on one thread of this machine." } else { "" };
     out += &format!(
         "<p class=\"note\">Compared on {} renders of {} from {}: {}. PSNR has peak 1 and is averaged \

@@ -87,8 +87,8 @@ impl Photographs {
         self.files.contains_key(&(view.frame, view.view))
     }
 
-    /// Returns for each photograph of `views` its path, its length in bytes, and the time of its last change (ns since
-    /// 1970). They show whether the photographs have changed, without reading them.
+    /// Returns for each photograph of `views` its path, its length in bytes, and its change time
+    /// ([`splat_platform::change_time`]). They show whether the photographs have changed, without reading them.
     ///
     /// # Errors
     /// Fails if a file does not exist any more.

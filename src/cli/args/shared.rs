@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use clap::builder::{PathBufValueParser, TypedValueParser as _};
 use clap::{Args, ValueEnum};
 
 use super::choices::{LINK_MODES, ROTATION_LAYOUTS, SPLITS, ZERO_ROTATIONS, choice};
-use super::values::{parse_bytes, parse_duration, parse_scratch_folder, parse_size, parse_times};
+use super::values::{check_scratch_folder, parse_bytes, parse_duration, parse_size, parse_times};
 use super::{CACHE, CAMERAS, MACHINE};
 use splatsieve::cache::Shard;
 use splatsieve::files::cameras::TimesSource;
@@ -33,7 +34,7 @@ pub(in crate::cli) struct Input {
     pub(in crate::cli) link: Option<LinkMode>,
     /// Folder for temporary files: frames of a stream, tracked frames, and data that do not fit into --memory [default:
     /// the folder that contains the output, else the system's folder for temporary files]
-    #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true, value_parser = parse_scratch_folder)]
+    #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true, value_parser = PathBufValueParser::new().try_map(check_scratch_folder))]
     pub(in crate::cli) scratch_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(in crate::cli) memory: Memory,

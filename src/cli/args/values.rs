@@ -7,10 +7,10 @@ use splatsieve::files::cameras::TimesSource;
 
 use crate::cli::recipe_flags::numbers;
 
-/// Parses the path of a folder for temporary files, and checks that files can be created in it.
-pub(super) fn parse_scratch_folder(text: &str) -> Result<PathBuf, String> {
-    match tempfile::tempfile_in(text) {
-        Ok(_) => Ok(PathBuf::from(text)),
+/// Returns `folder`, a folder for temporary files, after a check that files can be created in it.
+pub(super) fn check_scratch_folder(folder: PathBuf) -> Result<PathBuf, String> {
+    match tempfile::tempfile_in(&folder) {
+        Ok(_) => Ok(folder),
         Err(error) => Err(format!("cannot create a file in it: {error}; name a folder that exists and can be written")),
     }
 }

@@ -57,11 +57,11 @@ pub(super) enum Destination {
 pub(super) fn destination(target: &Path) -> Result<Destination> {
     // Without a separator at the end, because `link/` is the folder that the link leads to.
     let (parent, name) = split_target(target)?;
-    let target = &parent.join(name);
+    let entry = parent.join(name);
     let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.shown())));
-    let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
+    let Ok(named) = fs::symlink_metadata(&entry) else { return Ok(Destination::Free) };
     let is_link = named.is_symlink();
-    let found = match fs::metadata(target) {
+    let found = match fs::metadata(&entry) {
         Ok(found) => found.file_type(),
         Err(_) if is_link => return refuse("a link to nothing (its target does not exist), which is not replaced"),
         Err(error) => return Err(Error::io("examine", target)(error)),
@@ -70,7 +70,7 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
         FileKind::CharacterDevice | FileKind::Fifo => Ok(Destination::Stream),
         // Standard output that is redirected to a file, for example `/dev/stdout`: replacing the link would replace a
         // link that belongs to the system.
-        FileKind::File if is_link && leads_through_system_link(target) => {
+        FileKind::File if is_link && leads_through_system_link(&entry) => {
             refuse("a link of the system, which is not replaced")
         }
         FileKind::File => Ok(Destination::File),

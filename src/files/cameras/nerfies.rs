@@ -19,7 +19,7 @@ use serde_json::value::RawValue;
 
 use super::CameraOptions;
 use super::assemble::{ListedImage, RigBuilder, from_camera_to_world};
-use super::fields::{CameraFields, read_camera_text};
+use super::fields::{CameraFields, read_camera_text, shorten};
 use super::memory::MemoryCounter;
 use crate::error::{Error, Result, quoted};
 use crate::files::image::measure;
@@ -88,6 +88,11 @@ fn warps(file: &Path, ids: &[String], counter: &mut MemoryCounter) -> Result<Vec
         let image = images
             .get(id)
             .ok_or_else(|| Error::input(file, "", format!("the image {}", quoted(id)), "none of this name"))?;
+        let is_object = image.get().starts_with('{');
+        if !is_object {
+            let place = format!("image {}", quoted(id));
+            return Err(Error::input(file, place, "an object", shorten(image.get())));
+        }
         let fields = CameraFields::new(file, None, image.get())?;
         fields.optional_index("warp_id")?.ok_or_else(|| fields.wrong("warp_id", "a number"))
     };

@@ -100,12 +100,17 @@ fn others(file: &Path) -> Vec<PathBuf> {
 /// Returns the largest time stamp of the images that `file` lists, at least 0. Values that are not finite numbers are
 /// ignored without an error. `counter` limits the memory.
 fn latest_in(file: &Path, counter: &mut MemoryCounter) -> Result<f64> {
+    let used = counter.used;
     let text = read_camera_text(file, counter)?;
+    let fields = CameraFields::new(file, None, &text)?;
+    let images = if fields.is_list("frames") { fields.list("frames", counter)? } else { Vec::new() };
     let mut latest: f64 = 0.0;
-    for image in CameraFields::new(file, None, &text)?.list("frames", counter)? {
+    for image in images {
         let time = CameraFields::new(file, None, image.get()).and_then(|image| image.optional_number("time"));
         latest = latest.max(time.ok().flatten().unwrap_or(0.0));
     }
+    // The text and the list are dropped.
+    counter.used = used;
     Ok(latest)
 }
 

@@ -13,15 +13,6 @@ mod ascii;
 mod defects;
 pub(crate) mod header;
 mod layout;
-/// Returns whether the first 16 KiB of the header of the PLY file at `path` contain `text`. Also returns false if the file
-/// cannot be read.
-pub(crate) fn header_contains(path: &Path, text: &str) -> bool {
-    let mut head = Vec::new();
-    let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
-    let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
-    read && header.windows(text.len()).any(|bytes| bytes == text.as_bytes())
-}
-
 #[cfg(test)]
 pub(crate) mod tests;
 pub mod write;
@@ -44,6 +35,15 @@ use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, finite_logit};
 use crate::progress::Events;
 use crate::source::Ids;
+
+/// Returns whether the first 16 KiB of the header of the PLY file at `path` contain `text`. Also returns false if the
+/// file cannot be read.
+pub(crate) fn header_contains(path: &Path, text: &str) -> bool {
+    let mut head = Vec::new();
+    let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
+    let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
+    read && header.windows(text.len()).any(|bytes| bytes == text.as_bytes())
+}
 
 /// Maximum number of rows (Gaussians) read together. At SH degree 3 they take 32 KiB, so that all components are read
 /// from the processor's cache.

@@ -42,7 +42,8 @@ fn checkpoints(path: &Path) -> NumberedFiles {
     let in_folder = |folder: &Path| {
         let (mut one, first) = (numbered_files(folder, "ckpt_", ".pt"), numbered_files(folder, "ckpt_", "_rank0.pt"));
         one.extend(first);
-        one.sort_unstable_by(|a, b| b.cmp(a));
+        // A whole model comes before the part of one process, `ckpt_K_rank0.pt`.
+        one.sort_unstable_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
         one
     };
     let inner = in_folder(&path.join(CHECKPOINT_FOLDER));

@@ -68,7 +68,8 @@ impl ReceivedFrames {
     }
 
     /// Links the Gaussians of the received frames into tracks (Gaussians followed through frames) with the function
-    /// `link`, whose second argument is the memory in bytes that receiving the frames took. `kind` and `bytes` are the name of the original input's format, shown to users, and its size in bytes.
+    /// `link`, whose second argument is the memory in bytes that receiving the frames took. `kind`
+    /// and `bytes` are the name of the original input's format, shown to users, and its size in bytes.
     ///
     /// # Errors
     /// Fails if `link` fails or the temporary files cannot be read.

@@ -30,7 +30,8 @@ impl TrainingConfig {
         let path = root.join("cfg_args");
         let arguments = if path.is_file() { Arguments::read(&path)? } else { Arguments::default() };
         Ok(TrainingConfig {
-            source_path: arguments.get("source_path").string()?,
+            // Only a hint where the cameras may be, so a value of another type is no error.
+            source_path: arguments.get("source_path").string().unwrap_or_default(),
             white_background: arguments.get("white_background").bool(false)?,
             prefilter: arguments.get("prefilter_var").float(0.0)?,
             time_duration,
