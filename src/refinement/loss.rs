@@ -9,16 +9,9 @@ use crate::metrics::{METRIC_BYTES_PER_PIXEL, SSIM_GRADIENT_BYTES_PER_PIXEL, deci
 use crate::passes::pixel_stride;
 use crate::render::Image;
 
-/// Root mean square of the derivatives of the loss of a view after [`equalize_gradient`]: that of a view with 40 dB
-/// before it. Any value serves, because Adam does not depend on a constant factor.
-const VIEW_GRADIENT: f64 = 0.02;
-/// Minimum root mean square of derivatives that [`equalize_gradient`] scales to [`VIEW_GRADIENT`]: that of a view with
-/// 90 dB. Smaller errors are rounding errors.
-const MIN_GRADIENT: f64 = 6.3e-5;
-/// Weight of the loss of a guard view ([`super::targets::Targets::is_guard`]); that of other views is 1. With 1 instead,
-/// views inside the rig of `room2_dynerf` lost 0.15 dB, with 0.5 they lost 0.03 dB, and a camera outside the rig had
-/// 26.5 and 26.3 dB.
-pub(super) const GUARD_WEIGHT: f64 = 0.5;
+/// Weight of the newest step in the running mean square of derivatives (see [`limit_gradient`]). The earlier mean has
+/// the rest of 1.
+const NEWEST_WEIGHT: f64 = 0.1;
 
 /// Factor of the mean square error in the loss. For a render with 35 dB PSNR, the mean square error times this factor
 /// is 0.006.
@@ -47,7 +40,7 @@ pub(super) struct RenderQuality {
 
 impl Loss {
     /// Returns the derivative of the loss with respect to each color value of `render`, as an image. Derivatives are
-    /// multiplied by a factor, which [`equalize_gradient`] removes. `target`:
+    /// multiplied by the number of color values and by a constant; Adam does not depend on a constant factor. `target`:
     /// color values of the target view, 0 to 1 as 16-bit integers. For values of the render outside [0, 1] the
     /// derivative is 0, because a screen clamps these.
     pub(super) fn gradient(&self, render: &Image, target: &[u16]) -> Image {
@@ -123,17 +116,26 @@ fn image(render: &Image, target: &[u16]) -> Image {
     Image { data: target.iter().copied().map(wide).collect(), ..*render }
 }
 
-/// Scales the derivatives `gradient` of the loss of one view with respect to its color values so that their root mean
-/// square is `weight` · [`VIEW_GRADIENT`]. This makes the loss of a view `weight` times the root of its mean square
-/// error and the number of its pixels, instead of the mean square error: views with small errors count as much as views
-/// with large errors, of which those from outside the rig are an example. With SSIM in the loss, the scaling is the same. Derivatives whose root mean square is below [`MIN_GRADIENT`] stay small.
-/// Values that are not finite do not count: the renderer ignores their pixels.
-pub(super) fn equalize_gradient(gradient: &mut Image, weight: f64) {
+/// Limits the derivatives `gradient` of the loss of a guard view ([`Targets::is_guard`]) with respect to its color
+/// values. If their root mean square is above the root of `mean_square`, they are scaled down to it; if there is no
+/// mean yet, to 0. Without the limit, the large errors of guard views would raise the gradient magnitudes by which Adam
+/// divides, and so shorten later steps. The derivatives of any other view stay as they are, and their mean square
+/// updates `mean_square`. Values that are not finite do not count: the renderer ignores their pixels.
+pub(super) fn limit_gradient(gradient: &mut Image, is_guard: bool, mean_square: &mut Option<f64>) {
     let squares = gradient.data.iter().map(|&value| f64::from(value).powi(2)).filter(|square| square.is_finite());
     let (sum, count) = squares.fold((0.0, 0u32), |(sum, count), square| (sum + square, count + 1));
-    let root = (sum / f64::from(count.max(1))).sqrt();
-    let factor = (weight * VIEW_GRADIENT / root.max(MIN_GRADIENT)) as f32;
-    gradient.data.iter_mut().for_each(|value| *value *= factor);
+    if count == 0 {
+        return;
+    }
+    let own = sum / f64::from(count);
+    match *mean_square {
+        mean if is_guard => {
+            let factor = (mean.unwrap_or(0.0) / own.max(f64::MIN_POSITIVE)).sqrt().min(1.0) as f32;
+            gradient.data.iter_mut().for_each(|value| *value *= factor);
+        }
+        Some(mean) => *mean_square = Some(mean + NEWEST_WEIGHT * (own - mean)),
+        None => *mean_square = Some(own),
+    }
 }
 
 #[cfg(test)]
@@ -191,30 +193,27 @@ mod tests {
     }
 
     #[test]
-    fn every_view_has_equally_large_gradients() {
-        let root = |gradient: &Image| {
-            let finite = gradient.data.iter().filter(|value| value.is_finite());
-            let (sum, count) = finite.fold((0.0, 0.0), |(sum, count), &v| (sum + f64::from(v).powi(2), count + 1.0));
-            (sum / count).sqrt()
+    fn guard_views_pull_no_harder_than_other_views() {
+        let image = |value: f32| Image { width: 2, height: 1, data: vec![value, -value, 0.0, value, -value, 0.0] };
+        let limited = |value: f32, is_guard: bool, mean: &mut Option<f64>| {
+            let mut gradient = image(value);
+            limit_gradient(&mut gradient, is_guard, mean);
+            gradient.data[0]
         };
-        let equalized = |values: [f32; 6]| {
-            let mut gradient = Image { width: 2, height: 1, data: values.to_vec() };
-            equalize_gradient(&mut gradient, 1.0);
-            gradient
-        };
-        for scale in [1e-3, 0.02, 0.5, 1e4] {
-            let gradient = equalized([1.0, -2.0, 0.0, 0.5, 0.25, -1.0].map(|value| value * scale));
-            assert!((root(&gradient) - VIEW_GRADIENT).abs() < 1e-7, "{scale}");
-            assert!((gradient.data[1] / gradient.data[0] + 2.0).abs() < 1e-5, "{scale}: ratios stay");
-        }
-        let noise = equalized([1e-6; 6]);
-        assert!(noise.data[0] < 1e-3, "rounding errors are not scaled to the errors of a view");
-        assert!(equalized([0.0; 6]).data.iter().all(|&value| value == 0.0));
-        let odd = equalized([f32::NAN, 0.1, -0.1, 0.1, -0.1, f32::INFINITY]);
-        assert!((root(&odd) - VIEW_GRADIENT).abs() < 1e-7 && odd.data[0].is_nan());
-        let mut half = Image { width: 1, height: 1, data: vec![0.3, -0.3, 0.3] };
-        equalize_gradient(&mut half, 0.5);
-        assert!((root(&half) - 0.5 * VIEW_GRADIENT).abs() < 1e-7);
-        equalize_gradient(&mut Image { width: 0, height: 0, data: Vec::new() }, 1.0);
+        let mut mean = None;
+        assert_eq!((limited(0.5, true, &mut mean), mean), (0.0, None));
+        assert_eq!(limited(0.1, false, &mut mean), 0.1);
+        assert!((mean.unwrap() - 2.0 / 3.0 * 0.01).abs() < 1e-9);
+        assert!((limited(0.5, true, &mut mean) - 0.1).abs() < 1e-6, "scaled to the mean");
+        assert_eq!(limited(0.05, true, &mut mean), 0.05, "never scaled up");
+        let before = mean.unwrap();
+        limited(0.2, false, &mut mean);
+        assert!((mean.unwrap() - (before + 0.1 * (2.0 / 3.0 * 0.04 - before))).abs() < 1e-9);
+        let before = mean;
+        let mut odd = image(f32::NAN);
+        limit_gradient(&mut odd, false, &mut mean);
+        assert!(mean.unwrap() < before.unwrap(), "NaN is left out, and zeros lower the mean");
+        limit_gradient(&mut Image { width: 0, height: 0, data: Vec::new() }, false, &mut mean);
+        assert!(mean.unwrap() > 0.0);
     }
 }

@@ -2,7 +2,7 @@
 //! original model.
 //!
 //! Pruning leaves holes that only the survivors can fill, by growing their footprints over them. Gradient descent
-//! reduces the root mean square error (and, if set, 1 − SSIM) of one target view after another. Target views are renders of the
+//! reduces the squared error (and, if set, 1 − SSIM) of one target view after another. Target views are renders of the
 //! original from the cameras by which Gaussians are scored and from cameras in between, so that the result is not
 //! overfitted to a few views; a few are from outside the rig (`outside`). If many Gaussians have to go, refinement
 //! removes them in prune steps: optimize, rank the Gaussians again, remove the lowest-ranked, repeat. The final
@@ -167,11 +167,9 @@ impl RefineStage {
 
     /// Returns the cache key of the parameters of this stage. It does not depend on the input.
     pub(crate) fn key(&self) -> CacheKey {
-        // Results of a program with another loss are not used.
-        const LOSS: &str = "root mean square error, guard views half";
         let step_settings = (self.steps, self.steps_per_prune, self.prunes, self.keyframes);
         let view_settings = (self.target_views, self.validates, self.contrast_floor);
-        CacheKey::new(&(LOSS, self.columns.bits(), self.sh_degree, self.loss, step_settings, view_settings))
+        CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, step_settings, view_settings))
     }
 
     fn step_params(&self) -> StepParams {

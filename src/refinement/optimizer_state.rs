@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::linearized::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
-use super::loss::{GUARD_WEIGHT, Loss, RenderQuality, equalize_gradient};
+use super::loss::{Loss, RenderQuality, limit_gradient};
 use super::rounding::Rounding;
 use super::step_input::{StepFiles, StepInput};
 use super::targets::Targets;
@@ -93,6 +93,9 @@ pub(super) struct OptimizerState<'a> {
     /// Stride n of the training views: only every n-th column and row of pixels is rendered in optimization steps and
     /// for the ranking of a prune step.
     stride: NonZeroU32,
+    /// Running mean square of the derivatives of the loss with respect to color values ([`Loss::gradient`]), over the
+    /// optimization steps on views that are not guard views ([`Targets::is_guard`]). `None` before the first such step.
+    mean_square_gradient: Option<f64>,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
     /// Whether the frame states were evaluated again after `constant_optimizer` (optimizer of the stored parameters)
@@ -110,6 +113,8 @@ pub(super) struct OptimizerCheckpoint<Stored, Added, Means> {
     constant_optimizer: (Added, Means, usize),
     /// Number of steps since the frame states were evaluated.
     steps: usize,
+    /// Running mean square of the derivatives with respect to color values.
+    mean_square_gradient: Option<f64>,
     /// Delta, running means and step number of the optimizer of each keyframe.
     keyframe_optimizers: Vec<(Added, Means, usize)>,
 }
@@ -153,6 +158,7 @@ impl<'a> OptimizerState<'a> {
             prefetched: None,
             renderer: Renderer::on_all_threads(),
             stride: targets.stride(),
+            mean_square_gradient: None,
             steps: 0,
             reevaluated: false,
             frames,
@@ -294,6 +300,7 @@ impl<'a> OptimizerState<'a> {
             reevaluated: self.reevaluated.then_some((&self.stored, &self.baked_delta)),
             constant_optimizer: self.constant_optimizer.checkpoint(),
             steps: self.steps,
+            mean_square_gradient: self.mean_square_gradient,
             keyframe_optimizers: self.keyframe_optimizers.iter().map(Adam::checkpoint).collect(),
         }
     }
@@ -310,7 +317,7 @@ impl<'a> OptimizerState<'a> {
             self.reevaluate_states()?;
         }
         self.constant_optimizer.resume(checkpoint.constant_optimizer);
-        self.steps = checkpoint.steps;
+        (self.steps, self.mean_square_gradient) = (checkpoint.steps, checkpoint.mean_square_gradient);
         let keyframes = checkpoint.keyframe_optimizers;
         if !keyframes.is_empty() {
             self.enable_keyframes(keyframes.len());
@@ -478,10 +485,11 @@ impl<'a> OptimizerState<'a> {
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
         let OptimizerState { scene, targets, stride, ref frames, ref linearized, .. } = *self;
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
-        let weight = if targets.is_guard(k) { GUARD_WEIGHT } else { 1.0 };
+        let (is_guard, mean_square) = (targets.is_guard(k), &mut self.mean_square_gradient);
+        // Also updates the running mean.
         let pull = |render: &_| {
             let mut gradient = loss.gradient(render, &target);
-            equalize_gradient(&mut gradient, weight);
+            limit_gradient(&mut gradient, is_guard, mean_square);
             (0.0, gradient)
         };
         let (renderer, view) = (&mut self.renderer, targets.view(k, stride));

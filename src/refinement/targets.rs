@@ -312,8 +312,9 @@ impl Targets {
 
     /// Returns whether target view `k` is a guard view: a view from outside the rig, in a scene whose
     /// [`Scene::outside`] is below [`MIN_SCORED_OUTSIDE`]. The few guard views protect the quality of renders from
-    /// outside. All are training views. Prune steps do not rank by them. If the weight is larger, views from outside are
-    /// used like all others, and there are no guard views.
+    /// outside. All are training views. Derivatives of their loss are scaled down to the usual magnitude, and prune
+    /// steps do not rank by them. If the weight is larger, views from outside are used like all others, and there are
+    /// no guard views.
     pub(super) fn is_guard(&self, k: usize) -> bool {
         self.guard_cameras.contains(&self.views[k].camera)
     }
