@@ -5,7 +5,7 @@
 
 use std::fs::{self, File, FileType};
 use std::io::{self, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use splat_platform::{FileKind, open_without_waiting};
 
@@ -48,6 +48,17 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
         return Err(larger("more".to_owned()));
     }
     Ok(bytes)
+}
+
+/// Returns the paths of the entries of `folder`, sorted, because the file system determines the order of a listing.
+///
+/// # Errors
+/// Fails if the folder cannot be listed.
+pub(crate) fn sorted_entries(folder: &Path) -> Result<Vec<PathBuf>> {
+    let listed = fs::read_dir(folder).and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect());
+    let mut paths: Vec<PathBuf> = listed.map_err(Error::io("list", folder))?;
+    paths.sort();
+    Ok(paths)
 }
 
 /// Checks that `file_type`, the type of the file at `path`, is that of a regular file. The error names the type found.

@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::digest::hash_file;
+use super::open::sorted_entries;
 use super::ply::{Ply, PlyOptions, Property, TextRows, TextStore};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::limits::ReadLimit;
@@ -186,13 +187,8 @@ impl FrameFiles {
     /// # Errors
     /// Fails if the folder cannot be listed.
     pub(crate) fn list(folder: &Path, is_frame: impl Fn(&Path) -> bool) -> Result<FrameFiles> {
-        let mut paths = Vec::new();
-        for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
-            let path = entry.map_err(Error::io("list", folder))?.path();
-            if is_frame(&path) {
-                paths.push(path);
-            }
-        }
+        let mut paths = sorted_entries(folder)?;
+        paths.retain(|path| is_frame(path));
         paths.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
         let (frames, non_files) = paths.into_iter().partition(|path| path.is_file());
         Ok(FrameFiles { frames, non_files })

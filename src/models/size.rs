@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::archive::ArchiveSize;
 use crate::error::{Error, Result};
+use crate::files::open::sorted_entries;
 
 /// Files of a model besides its Gaussians, for [`ModelSize::from_cloud_file`]: none.
 pub(super) const NO_FILES: [&str; 0] = [];
@@ -111,8 +112,7 @@ pub(crate) fn bytes_below(path: &Path) -> Result<u64> {
     if !found.is_dir() {
         return Ok(found.len());
     }
-    let entries = fs::read_dir(path).map_err(Error::io("list", path))?;
-    entries.map(|entry| bytes_below(&entry.map_err(Error::io("list", path))?.path())).sum()
+    sorted_entries(path)?.iter().map(|entry| bytes_below(entry)).sum()
 }
 
 #[cfg(test)]

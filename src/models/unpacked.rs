@@ -1,6 +1,5 @@
 //! Inputs that are unpacked into temporary files, and opened from there as an input of another format.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
@@ -8,9 +7,10 @@ use xxhash_rust::xxh3::Xxh3;
 use super::size::{ModelSize, file_bytes};
 use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::files::atomic::ScratchFolder;
 use crate::files::digest::hash_file;
+use crate::files::open::sorted_entries;
 use crate::limits::Limits;
 use crate::model::Gaussians;
 use crate::models::input_model::{InputModel, MemoryProfile, ModelDescription, TimeOrigin};
@@ -168,16 +168,7 @@ fn files_of_frames(paths: &[PathBuf]) -> Result<Vec<PathBuf>> {
             files.push(path.clone());
             continue;
         }
-        let listed = fs::read_dir(path).map_err(Error::io("list", path))?;
-        let mut inside = Vec::new();
-        for entry in listed {
-            let file = entry.map_err(Error::io("list", path))?.path();
-            if file.is_file() {
-                inside.push(file);
-            }
-        }
-        inside.sort();
-        files.extend(inside);
+        files.extend(sorted_entries(path)?.into_iter().filter(|file| file.is_file()));
     }
     Ok(files)
 }

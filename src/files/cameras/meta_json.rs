@@ -49,9 +49,9 @@ fn add_file(builder: &mut RigBuilder, file: &Path, split: Split) -> Result<usize
     let text = read_camera_text(file, counter)?;
     let shared = CameraFields::new(file, None, &text)?;
     let (width, height) = (shared.side("w")?, shared.side("h")?);
-    let frames = shared.list("k", counter)?.len();
     let mut lists = Vec::new();
-    for key in KEYS.into_iter().filter(|key| shared.has(key)) {
+    // The first key is required, the others may be missing.
+    for key in KEYS.into_iter().filter(|key| *key == KEYS[0] || shared.has(key)) {
         let mut by_frame = Vec::new();
         for (frame, cameras) in shared.list(key, counter)?.into_iter().enumerate() {
             if !cameras.get().starts_with('[') {
@@ -62,7 +62,7 @@ fn add_file(builder: &mut RigBuilder, file: &Path, split: Split) -> Result<usize
         }
         lists.push((key, by_frame));
     }
-    let cameras = |frame: usize| lists[0].1[frame].len();
+    let (frames, cameras) = (lists[0].1.len(), |frame: usize| lists[0].1[frame].len());
     builder.begin_file(file, (0..frames).map(cameras).sum())?;
     for (frame, camera) in (0..frames).flat_map(|frame| (0..cameras(frame)).map(move |camera| (frame, camera))) {
         let values = lists.iter().filter_map(|(key, by_frame)| Some((*key, *by_frame.get(frame)?.get(camera)?)));

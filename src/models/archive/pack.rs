@@ -22,6 +22,7 @@ use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, TensorView, ValueType};
 use crate::files::npz::Npz;
 use crate::files::npz::write::GaussianAxis;
+use crate::files::open::sorted_entries;
 use crate::files::ply::{Ply, PlyEncoding, Property, Scalar};
 use crate::files::splatv::{ROW_BYTES, Splatv};
 use crate::limits::ReadLimit;
@@ -544,8 +545,7 @@ fn has_dense_rows(tensor: &TensorView) -> bool {
 /// Adds every file below `folder` to `files`: its path relative to `root`, with `/` between names, and the path by
 /// which it can be opened. Leaves out the list of cameras, which renderers do not need.
 fn list_files(root: &Path, folder: &Path, files: &mut Vec<(String, PathBuf)>) -> Result<()> {
-    for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
-        let path = entry.map_err(Error::io("list", folder))?.path();
+    for path in sorted_entries(folder)? {
         if path.is_dir() {
             list_files(root, &path, files)?;
             continue;
