@@ -78,7 +78,8 @@ impl RunPlan {
 
     /// Returns the plan of a run that stays within the memory limit of `request`. If full refinement does not fit,
     /// tries smaller plans in this order, and returns the first one that fits:
-    /// - parameter deltas (values that refinement adds to stored parameters) are constant in time;
+    /// - refinement begins with fewer Gaussians;
+    /// - also, parameter deltas (values that refinement adds to stored parameters) are constant in time;
     /// - also, SH coefficients above degree 0 are not refined;
     /// - nothing is refined.
     ///
@@ -120,9 +121,14 @@ impl RunPlan {
             return Ok(full_plan);
         }
         let full_bytes = least(&full_plan);
-        let constant = with(MemoryFallback::ConstantInTime { required_bytes: full_bytes })?;
+        let small_start = with(MemoryFallback::SmallStart { required_bytes: full_bytes })?;
+        let small_start_bytes = least(&small_start);
+        if small_start_bytes < full_bytes && fits(&small_start) {
+            return Ok(small_start);
+        }
+        let constant = with(MemoryFallback::ConstantInTime { required_bytes: small_start_bytes })?;
         let constant_bytes = least(&constant);
-        if constant_bytes < full_bytes && fits(&constant) {
+        if constant_bytes < small_start_bytes && fits(&constant) {
             return Ok(constant);
         }
         let low_degree = with(MemoryFallback::WithoutHarmonics { required_bytes: constant_bytes })?;
@@ -135,7 +141,7 @@ impl RunPlan {
         }
         // None fits: the error names the memory of the smallest plan.
         let smaller = |a: RunPlan, b: RunPlan| if least(&b) < least(&a) { b } else { a };
-        Ok([low_degree, constant, full_plan].into_iter().fold(unrefined, smaller))
+        Ok([low_degree, constant, small_start, full_plan].into_iter().fold(unrefined, smaller))
     }
 
     fn empty(measure: MeasureStages, gaussians: usize) -> RunPlan {
@@ -184,9 +190,10 @@ impl RunPlan {
         let refine = RefineStage::from_recipe(recipe, planning.target_fraction(), planning.prunes_by_views());
         planning.refine = refine.and_then(|refine| match fallback {
             MemoryFallback::Nothing => Some(refine),
-            MemoryFallback::ConstantInTime { .. } => Some(refine.with_time_independent_deltas()),
+            MemoryFallback::SmallStart { .. } => Some(refine.with_small_start()),
+            MemoryFallback::ConstantInTime { .. } => Some(refine.with_small_start().with_time_independent_deltas()),
             MemoryFallback::WithoutHarmonics { .. } => {
-                Some(refine.with_time_independent_deltas().with_fixed_higher_sh())
+                Some(refine.with_small_start().with_time_independent_deltas().with_fixed_higher_sh())
             }
             MemoryFallback::WithoutRefinement { .. } => None,
         });
@@ -201,7 +208,7 @@ impl RunPlan {
         plan.output = Some(WriteStage::from_planning(&planning));
         plan.target = target;
         plan.stages.counts = CountPlan {
-            prunes_in_refinement: planning.refine.as_ref().is_some_and(|refine| refine.prunes),
+            max_start: planning.refine.as_ref().and_then(|refine| refine.prunes.then_some(refine.max_start)),
             searches: plan.search.is_some(),
         };
         (plan.merges, plan.refine, plan.fallback) = (planning.merges, planning.refine.clone(), fallback);
@@ -425,12 +432,7 @@ mod tests {
             );
             (plan.fallback, plan.refine.map(|refine| refine.sh_degree), time.filter(|_| bands.is_none()).or(bands), all)
         };
-        let least = |spared: MemoryFallback| match spared {
-            MemoryFallback::ConstantInTime { required_bytes }
-            | MemoryFallback::WithoutHarmonics { required_bytes }
-            | MemoryFallback::WithoutRefinement { required_bytes } => required_bytes,
-            MemoryFallback::Nothing => 0,
-        };
+        let least = |spared: MemoryFallback| spared.required_bytes().unwrap_or_default();
         let full_bytes = MemoryPlan::closest(work, 1, all_estimates("default")).peak_bytes();
         assert_eq!(within(full_bytes).0, MemoryFallback::Nothing);
         let (spared, degree, named, none) = within(full_bytes - 1);
@@ -455,6 +457,27 @@ mod tests {
         assert!(named.unwrap().contains(&format!("{}MiB", bands.div_ceil(1 << 20))));
         // With a limit below all reduced plans, the smallest plan is returned, which is refused later.
         assert_eq!(within(1 << 20).0, MemoryFallback::WithoutRefinement { required_bytes: bands });
+    }
+
+    #[test]
+    fn small_budget_first_begins_with_fewer_gaussians() {
+        let work = work(200_000);
+        let fallback_below_full = |ratio: f64| {
+            let mut request = request(Recipe::preset("default").unwrap());
+            request.target = Some(Target::Ratio(ratio));
+            let full = RunPlan::new(&request, INPUT).unwrap();
+            let estimates = |work: &Workload, limits: &Limits| full.estimates(work, limits);
+            let full_bytes = MemoryPlan::closest(work, 1, estimates).peak_bytes();
+            request.input.memory = budget(full_bytes - 1);
+            let plan = RunPlan::within_memory(&request, INPUT, &work).unwrap();
+            let mut journal = Journal::default();
+            plan.stages.record_left_out(&work, &Limits::NONE, &mut journal);
+            let is_named = journal.left_out.iter().any(|left| left.what == "more Gaussians at the start of refinement");
+            (plan.fallback == MemoryFallback::SmallStart { required_bytes: full_bytes }, is_named)
+        };
+        assert_eq!(fallback_below_full(0.3), (true, true));
+        // 10% of the Gaussians already begin with less than 40%.
+        assert_eq!(fallback_below_full(0.1), (false, false));
     }
 
     #[test]
@@ -495,9 +518,9 @@ mod tests {
         };
         let default = || Recipe::preset("default").unwrap();
         let (refined, text) = counts(default(), Some(0.1), None);
-        assert_eq!(refined, [400, 400]);
+        assert_eq!(refined, [301, 301]);
         assert!(
-            text.contains("ranking leaves 400 of 1000 Gaussians (40%), refinement removes 300 of them; 100 stay"),
+            text.contains("ranking leaves 301 of 1000 Gaussians (30%), refinement removes 201 of them; 100 stay"),
             "{text}"
         );
         assert!(text.contains("\n  refine: ") && text.contains("\n  left out: merging"), "{text}");
@@ -506,7 +529,7 @@ mod tests {
         assert!(text.contains("leave 100 of 1000 Gaussians (10%); refinement removes none"), "{text}");
         // A search ranks only once, down to the smallest number of Gaussians that it may try.
         let psnr = || Some(Goal::Quality(Quality::Psnr(30.0)));
-        assert_eq!(counts(default(), None, psnr()).0, [400, 400]);
+        assert_eq!(counts(default(), None, psnr()).0, [135, 301]);
         assert_eq!(counts(default().without_refinement(), None, psnr()).0, [20, 100]);
     }
 }

@@ -115,12 +115,18 @@ pub(crate) enum MemoryFallback {
     /// Full refinement; no part is omitted.
     #[default]
     Nothing,
-    /// Refinement without time-varying deltas: the values that it adds to stored parameters are constant in time.
+    /// Refinement that begins with fewer Gaussians.
+    SmallStart {
+        /// Smallest memory limit, bytes, with which refinement would begin with more Gaussians.
+        required_bytes: u64,
+    },
+    /// Refinement that also has no time-varying deltas: the values that it adds to stored parameters are constant in
+    /// time.
     ConstantInTime {
         /// Smallest memory limit, bytes, with which refinement would also add values that vary in time.
         required_bytes: u64,
     },
-    /// Refinement without time-varying deltas and without SH coefficients above degree 0.
+    /// Refinement that also leaves out SH coefficients above degree 0.
     WithoutHarmonics {
         /// Smallest memory limit, bytes, with which SH coefficients above degree 0 would be refined.
         required_bytes: u64,
@@ -133,11 +139,23 @@ pub(crate) enum MemoryFallback {
 }
 
 impl MemoryFallback {
-    /// Returns the names of the omitted parts of refinement, each with the smallest memory limit, bytes, with which it
-    /// would be included.
+    /// Returns the smallest memory limit, bytes, with which the part of refinement that was omitted last would be
+    /// included; `None` if no part is omitted.
+    pub(super) fn required_bytes(self) -> Option<u64> {
+        match self {
+            MemoryFallback::Nothing => None,
+            MemoryFallback::SmallStart { required_bytes }
+            | MemoryFallback::ConstantInTime { required_bytes }
+            | MemoryFallback::WithoutHarmonics { required_bytes }
+            | MemoryFallback::WithoutRefinement { required_bytes } => Some(required_bytes),
+        }
+    }
+
+    /// Returns the names of the omitted parts of refinement, except of Gaussians at its start, each with the smallest
+    /// memory limit, bytes, with which it would be included.
     pub(super) fn left_out(self) -> Vec<(&'static str, u64)> {
         match self {
-            MemoryFallback::Nothing => Vec::new(),
+            MemoryFallback::Nothing | MemoryFallback::SmallStart { .. } => Vec::new(),
             MemoryFallback::ConstantInTime { required_bytes } => {
                 vec![("time-varying deltas of refinement", required_bytes)]
             }

@@ -30,7 +30,7 @@ use crate::outputs::kind::{Fidelity, OutputKind};
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::prune_steps::PrunedModels;
-use crate::refinement::targets::{TargetViewParams, Targets, ViewSplit};
+use crate::refinement::targets::{TargetViewParams, Targets, ViewSplit, ViewStrides};
 use crate::refinement::{RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
@@ -161,10 +161,10 @@ impl SearchStage {
         // A rendered view, and the image that it is compared with: once as read, once as used.
         need.fixed.push(("compared images", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
         need.fixed.push(("field", work.input.fixed));
-        // Each prune step removes a fifth of the Gaussians, starting from two fifths of all. So the models that are
-        // kept after prune steps have together twice as many Gaussians as the input.
+        // Each prune step removes a fifth of the Gaussians. So the models that are kept after prune steps have together
+        // up to about three times as many Gaussians as the input.
         need.per_gaussian.extend([
-            ("search models", 3 * (whole + 8)),
+            ("search models", 4 * (whole + 8)),
             ("result", work.input.compressed),
             ("survivors", choose::BYTES_PER_GAUSSIAN),
         ]);
@@ -184,7 +184,8 @@ impl SearchStage {
             let photographs = self.photographs(scene)?;
             let (pixels, count) = (scene.workload().pixels, scored.gaussian_count());
             let stride = self.refine.as_ref().map_or(NonZeroU32::MIN, |refine| refine.stride(pixels, count));
-            let targets = Targets::new(scene, self.target_views, stride, photographs.is_none())?;
+            let strides = ViewStrides::with_whole_validation(stride);
+            let targets = Targets::new(scene, self.target_views, strides, photographs.is_none())?;
             let parts = targets.split();
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());

@@ -28,8 +28,8 @@ use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
-/// In a run that searches for the smallest model with a requested quality and does not refine, the last pruning round
-/// leaves this fraction of the Gaussians.
+/// In a run that searches for the smallest model with a requested quality, the last pruning round leaves as many
+/// Gaussians as a target of this fraction of the Gaussians needs.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
 
 /// Phase of a run to which a stage belongs.
@@ -158,9 +158,11 @@ pub struct CompressedScene {
 /// optimization steps).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CountPlan {
-    /// Whether refinement removes Gaussians in prune steps, until the target is reached. Otherwise only ranking removes
-    /// Gaussians.
-    pub prunes_in_refinement: bool,
+    /// Largest fraction of the Gaussians with which refinement begins ([`RefineStage::max_start`]), if it removes
+    /// Gaussians in prune steps until the target is reached. `None` if only ranking removes Gaussians.
+    ///
+    /// [`RefineStage::max_start`]: crate::refinement::RefineStage::max_start
+    pub max_start: Option<f64>,
     /// Whether the run searches for the number of Gaussians in the output.
     pub searches: bool,
 }
@@ -169,7 +171,7 @@ impl CountPlan {
     /// Returns the number of Gaussians with which refinement begins. `target_count`: number of Gaussians in the output.
     /// `input_count`: number of Gaussians in the input.
     pub fn count_before_refinement(&self, target_count: usize, input_count: usize) -> usize {
-        if self.prunes_in_refinement { start_count(target_count, input_count) } else { target_count }
+        self.max_start.map_or(target_count, |max_start| start_count(target_count, input_count, max_start))
     }
 
     /// Returns the number of Gaussians that ranking leaves. `target_count`: number of Gaussians in the output.
@@ -177,10 +179,7 @@ impl CountPlan {
     /// several models but ranks only once. In such a run the result is the number that the smallest tried model needs,
     /// whatever `target_count` is.
     pub fn count_after_ranking(&self, target_count: usize, input_count: usize) -> usize {
-        let smallest = match self.prunes_in_refinement {
-            true => 0,
-            false => (SEARCH_RANK_FRACTION * input_count as f64).ceil() as usize,
-        };
+        let smallest = (SEARCH_RANK_FRACTION * input_count as f64).ceil() as usize;
         self.count_before_refinement(if self.searches { smallest } else { target_count }, input_count)
     }
 
@@ -192,7 +191,7 @@ impl CountPlan {
             format!("{count} of {input_count} Gaussians ({:.0}%)", 100.0 * count as f64 / input_count.max(1) as f64)
         };
         let alone = if merges { "ranking and merging leave" } else { "ranking leaves" };
-        match (target, self.prunes_in_refinement) {
+        match (target, self.max_start.is_some()) {
             (Some(target_count), true) => {
                 let ranked = self.count_before_refinement(target_count, input_count);
                 let removed = ranked - target_count;

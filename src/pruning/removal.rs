@@ -6,17 +6,9 @@ use std::num::NonZeroU32;
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, FrameView};
-use crate::passes::pixel_stride;
 use crate::passes::views::{RenderedSource, Workers};
 use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
-
-/// Returns the stride n for the renders by which `count` Gaussians are ranked: only every n-th column and row of pixels
-/// is rendered, about one pixel per Gaussian. More pixels would change the ranking less than other views would.
-/// `pixels`: number of pixels of a view.
-pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
-    pixel_stride(pixels, count as f64)
-}
 
 /// Renders only the Gaussians `ids` and returns for each of them the [`RemovalError`], the squared error that removing
 /// it would cause, summed over `views`. Only every `stride`-th column and row of pixels is rendered. The square of

@@ -9,9 +9,8 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{CONTRIBUTION_COST, ResourceEstimate, Workload};
 use crate::model::{Attributes, Statistic, StatisticRows};
-use crate::passes::{frames_needed_to_see_all, scoring_views};
+use crate::passes::{frames_needed_to_see_all, pixel_stride, scoring_views};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
-use crate::pruning::removal::ranking_stride;
 use crate::recipe::{self, Coverage};
 use crate::render::Contribution;
 use crate::scene::Scene;
@@ -26,8 +25,8 @@ pub struct VisibilityStage {
     /// Parameters by which statistics are computed. This stage uses only the strides of pixels, views and frames, and
     /// the maximum number of views.
     pub recipe: recipe::ScanParams,
-    /// Whether pruning rounds will rank the Gaussians again. If so, this stage has to render only every n-th column and
-    /// row of pixels, where n is [`ranking_stride`].
+    /// Whether pruning rounds will rank the Gaussians again. If so, this stage renders only every n-th column and row of
+    /// pixels, so that there is about one pixel per Gaussian.
     pub is_preliminary: bool,
 }
 
@@ -74,7 +73,7 @@ impl VisibilityStage {
     /// Returns the stride n for the renders that measure the contributions of `count` Gaussians: only every n-th column
     /// and row of pixels is rendered. `pixels`: number of pixels of a view.
     fn pixel_stride(&self, pixels: u64, count: usize) -> NonZeroU32 {
-        let of_ranking = if self.is_preliminary { ranking_stride(pixels, count) } else { NonZeroU32::MIN };
+        let of_ranking = if self.is_preliminary { pixel_stride(pixels, count as f64) } else { NonZeroU32::MIN };
         self.recipe.pixel_stride.max(of_ranking)
     }
 

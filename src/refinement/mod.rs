@@ -40,12 +40,13 @@ use crate::memory_plan::{
     bytes_of_survivors,
 };
 use crate::model::{Attributes, NO_SH_LIMIT};
+use crate::passes::pixel_stride;
 use crate::pruning::score::scored_memory;
 use crate::recipe;
 use crate::refinement::optimizer_state::{REEVALUATE_EVERY, StepParams, keyframe_count};
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES, STRIP_BYTES};
 use loss::Loss;
-use targets::TargetViewParams;
+use targets::{TargetViewParams, ViewStrides};
 
 /// Name of the refinement stage in messages and in the cache.
 const NAME: &str = "refine";
@@ -56,9 +57,23 @@ const STEP_RENDERS: f64 = 3.0;
 /// Validation PSNR in dB at or above which refinement is skipped as useless: the root mean square error is then at most
 /// about a quarter of an 8-bit step.
 pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
-/// Minimum fraction of all Gaussians with which refinement begins. Ranking alone chooses the Gaussians at the
-/// beginning; prune steps between optimization steps then remove more of them.
-const MIN_START_COUNT_FRACTION: f64 = 0.4;
+/// Refinement to the fraction k of all Gaussians begins with the fraction `START_FACTOR` · √k, if that is more. Ranking
+/// alone chooses the Gaussians at the beginning; prune steps between optimization steps then remove more of them. With
+/// optimized survivors, a ranking is better, but every step with more Gaussians takes longer.
+const START_FACTOR: f64 = 0.95;
+/// Largest fraction of all Gaussians with which refinement begins, unless more are to stay, if there is little memory.
+const SMALL_START: f64 = 0.4;
+/// Largest fraction of all Gaussians for which there are as many final steps as [`RefineStage::steps`] says, but for
+/// the factor of [`STEP_COST_POWER`]. If more stay, less has to be made up for.
+const FULL_STEPS_FRACTION: f64 = 0.4;
+/// Fraction of all Gaussians above which there are fewer final steps, because each takes longer.
+const CHEAP_STEPS_FRACTION: f64 = 0.1;
+/// For the fraction k of all Gaussians, above [`CHEAP_STEPS_FRACTION`], the number of final steps has the factor
+/// ([`CHEAP_STEPS_FRACTION`] / k) to this power.
+const STEP_COST_POWER: f64 = 0.25;
+/// Approximate number of pixels of a validation view that are rendered and compared. Validation views of more pixels
+/// are rendered at a stride.
+const VALIDATION_PIXELS: f64 = 20_000.0;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_KEPT_FRACTION: f64 = 0.8;
 /// Number of views by which the Gaussians are ranked for one prune step, less the guard views among them. Each prune
@@ -92,6 +107,8 @@ pub struct RefineStage {
     pub validates: bool,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub prunes: bool,
+    /// Largest fraction of all Gaussians with which a refinement with prune steps begins, unless more are to stay.
+    pub max_start: f64,
     /// Constant c of the removal errors by which Gaussians are ranked for a prune step: c² is added to each squared
     /// difference between the color of a Gaussian and the colors that it hides (norm over red, green, blue, each from 0
     /// to 1). See [`crate::render::RemovalError`].
@@ -133,6 +150,7 @@ impl RefineStage {
             target_views: TargetViewParams::from_recipe(&recipe.refine),
             validates: refine_validate,
             prunes,
+            max_start: 1.0,
             contrast_floor: recipe.select.contrast_floor,
             keyframes: refine_keyframes,
             archive_steps: refine_archive_steps as usize,
@@ -150,6 +168,25 @@ impl RefineStage {
     /// not vary with time.
     pub fn with_time_independent_deltas(self) -> RefineStage {
         RefineStage { keyframes: 0, ..self }
+    }
+
+    /// Returns a copy of this stage that begins with fewer Gaussians, at most the fraction [`SMALL_START`] unless more
+    /// are to stay. It takes less memory.
+    pub fn with_small_start(self) -> RefineStage {
+        RefineStage { max_start: SMALL_START, ..self }
+    }
+
+    /// Returns whether this stage may begin with fewer Gaussians than it would without the limit
+    /// [`RefineStage::max_start`].
+    pub(crate) fn has_smaller_start(&self) -> bool {
+        let is_limited =
+            self.target.is_none_or(|target| start_fraction(target, self.max_start) < start_fraction(target, 1.0));
+        self.prunes && self.max_start < 1.0 && is_limited
+    }
+
+    /// Returns the fraction of all Gaussians with which this stage begins, if it ends with the fraction `target`.
+    fn first_fraction(&self, target: f64) -> f64 {
+        if self.prunes { start_fraction(target, self.max_start) } else { target }
     }
 
     /// Returns a copy of this stage that removes no Gaussians.
@@ -176,13 +213,19 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. It is
-    /// [`RefineStage::stride`] for `first` Gaussians, the number with which refinement begins. If prune steps remove
-    /// Gaussians, it is the stride for a third of `first`, because fewer Gaussians allow a larger stride. `pixels`:
-    /// number of pixels of a view.
-    pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
+    /// Returns the strides at which the target views are stored. That of the training views is [`RefineStage::stride`]
+    /// for `first` Gaussians, the number with which refinement begins. If prune steps remove Gaussians, it is the
+    /// stride for a third of `first`, because fewer Gaussians allow a larger stride. `pixels`: number of pixels of a
+    /// view.
+    pub(crate) fn stored_strides(&self, pixels: u64, first: usize) -> ViewStrides {
         let fewer = if self.prunes { first / 3 } else { first };
-        self.stride(pixels, fewer)
+        ViewStrides { training: self.stride(pixels, fewer), validation: self.validation_stride(pixels) }
+    }
+
+    /// Returns the stride of the validation views, which have `pixels` pixels each: 1 if SSIM is part of the loss,
+    /// otherwise such that about [`VALIDATION_PIXELS`] are left.
+    fn validation_stride(&self, pixels: u64) -> NonZeroU32 {
+        if self.loss.ssim > 0.0 { NonZeroU32::MIN } else { pixel_stride(pixels, VALIDATION_PIXELS) }
     }
 
     /// Returns the stride n of the training views: only every n-th column and row of pixels is rendered and compared.
@@ -192,12 +235,14 @@ impl RefineStage {
     }
 
     /// Returns the number of final steps (optimization steps after the last prune step) for a model that keeps `count`
-    /// of `all` Gaussians: [`RefineStage::steps`] · (1 − `count`/`all`) / (1 − [`MIN_START_COUNT_FRACTION`]), at most
-    /// [`RefineStage::steps`], rounded up.
+    /// of `all` Gaussians, rounded up. With k = `count` / `all`, it is [`RefineStage::steps`] times two factors of at
+    /// most 1: (1 − k) / (1 − [`FULL_STEPS_FRACTION`]), and ([`CHEAP_STEPS_FRACTION`] / k) to the power of
+    /// [`STEP_COST_POWER`].
     fn final_step_count(&self, count: usize, all: usize) -> usize {
         let kept = count as f64 / all.max(1) as f64;
-        let part = ((1.0 - kept) / (1.0 - MIN_START_COUNT_FRACTION)).clamp(0.0, 1.0);
-        (part * self.steps as f64).ceil() as usize
+        let removed_part = ((1.0 - kept) / (1.0 - FULL_STEPS_FRACTION)).clamp(0.0, 1.0);
+        let cost_factor = (CHEAP_STEPS_FRACTION / kept).powf(STEP_COST_POWER).min(1.0);
+        (removed_part * cost_factor * self.steps as f64).ceil() as usize
     }
 
     /// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame,
@@ -211,11 +256,11 @@ impl RefineStage {
         }
     }
 
-    /// Returns the number of optimization steps before a prune step: `steps_per_prune` · √(`target_count` / `count`),
+    /// Returns the number of optimization steps before a prune step: `steps_per_prune` · `target_count` / `count`,
     /// rounded up, for `count` Gaussians now and `target_count` Gaussians after the last prune step. With more
     /// Gaussians there are fewer steps, because a step takes longer and more of its effect is removed later.
     fn steps_before(&self, count: usize, target_count: usize) -> usize {
-        (self.steps_per_prune as f64 * (target_count as f64 / count.max(1) as f64).sqrt()).ceil() as usize
+        (self.steps_per_prune as f64 * target_count as f64 / count.max(1) as f64).ceil() as usize
     }
 
     /// Returns the resource estimate (bytes of memory, seconds) of refinement for the input `work`. The memory holds
@@ -267,7 +312,7 @@ impl RefineStage {
         let keyframe_steps = (keyframe_count > 0)
             .then(|| phase(wanted, Some(("trajectory delta", keyframe_count as u64 * keyframe_bytes))));
         let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
-        let first = if self.prunes { wanted.max(MIN_START_COUNT_FRACTION) } else { wanted };
+        let first = self.first_fraction(wanted);
         let stages = [Some(original), Some(phase(first, None)), keyframe_steps];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
         // There may be fewer views than are asked for. Their number is 0 if it is not known.
@@ -275,7 +320,7 @@ impl RefineStage {
         let (target_views, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let last_count = (wanted * 1e6) as usize;
-        let first_count = if self.prunes { start_count(last_count, 1_000_000) } else { last_count };
+        let first_count = (self.first_fraction(wanted) * 1e6).ceil() as usize;
         let prune_counts = prune_counts(first_count, last_count);
         let final_steps = self.final_step_count(last_count, 1_000_000);
         let steps = final_steps + if keyframe_count > 0 { along_time(final_steps) } else { 0 };
@@ -296,7 +341,7 @@ impl RefineStage {
                 + strided.render_seconds(ranked, count, REMOVAL_COST)
         };
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
-        let stored = work.on_grid(self.stored_stride(work.pixels, first as usize));
+        let stored = work.on_grid(self.stored_strides(work.pixels, first as usize).training);
         // Whole views are rendered for validation, `together` at a time, with 6 bytes per pixel of the target view.
         // Steps render pixels of a grid, and hold the image, its gradient and the target views of two steps.
         let whole_views = together * 24 * work.pixels;
@@ -319,9 +364,16 @@ impl RefineStage {
 }
 
 /// Returns the number of Gaussians with which a refinement with prune steps begins: the larger of `target_count`, the
-/// number with which it ends, and the fraction [`MIN_START_COUNT_FRACTION`] of the `all` Gaussians of the model.
-pub(crate) fn start_count(target_count: usize, all: usize) -> usize {
-    target_count.max((MIN_START_COUNT_FRACTION * all as f64).ceil() as usize).min(all)
+/// number with which it ends, and the fraction [`start_fraction`] of the `all` Gaussians of the model.
+pub(crate) fn start_count(target_count: usize, all: usize, max_start: f64) -> usize {
+    let fraction = start_fraction(target_count as f64 / all.max(1) as f64, max_start);
+    target_count.max((fraction * all as f64).ceil() as usize).min(all)
+}
+
+/// Returns the fraction of all Gaussians with which a refinement with prune steps begins, if it ends with the fraction
+/// `target`, from 0 to 1: [`START_FACTOR`] · √`target`, but at most `max_start` and at least `target`.
+fn start_fraction(target: f64, max_start: f64) -> f64 {
+    target.max((START_FACTOR * target.sqrt()).min(max_start))
 }
 
 /// Returns the number of optimization steps of the trajectory delta, which is optimized after the constant delta: two

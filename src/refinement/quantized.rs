@@ -69,6 +69,7 @@ mod tests {
     use crate::pipeline::tests::{scene, score_scene};
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
+    use crate::refinement::targets::ViewStrides;
 
     #[test]
     fn refined_parameters_render_better_after_rounding() {
@@ -82,7 +83,8 @@ mod tests {
         let fixed: Vec<bool> = kept.iter().map(|id| id % 7 == 0).collect();
         let compressed = crate::compressed_model::CompressedModel::pruned(kept, &recipe.merge);
         let result = scene.input.compressed_frames(&compressed).unwrap();
-        let targets = Targets::new(&scene, stage.target_views, std::num::NonZeroU32::MIN, false).unwrap();
+        let whole = ViewStrides::with_whole_validation(std::num::NonZeroU32::MIN);
+        let targets = Targets::new(&scene, stage.target_views, whole, false).unwrap();
         let start = crate::passes::gather_all(&*result, 0, Attributes::all()).unwrap();
         // Log scales, opacities and colors in steps of 1/2, positions and rotations in steps of 2^-10.
         let steps = [-80, -80, -8, -8, -8, -8, -8, -8];

@@ -70,8 +70,8 @@ impl RefineStage {
         let key = scene.work.key(&(self.key(), &compressed, target_count, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, count, scene.source(), |journal| {
-                let targets =
-                    Targets::new(scene, self.target_views, self.stored_stride(scene.workload().pixels, count), false)?;
+                let strides = self.stored_strides(scene.workload().pixels, count);
+                let targets = Targets::new(scene, self.target_views, strides, false)?;
                 scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets);
                 Ok((run.run_all(&compressed, target_count, steps, journal)?.0, target_count))

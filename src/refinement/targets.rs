@@ -113,7 +113,7 @@ fn fraction([part, of]: [usize; 2], count: usize) -> usize {
 
 /// Target views in a scratch file: renders of the original model, or photographs. Their cameras are the cameras by
 /// which Gaussians are scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the
-/// rig. Training views are stored only at the pixels of a grid; validation and test views are stored as a whole.
+/// rig. Training and validation views are stored only at the pixels of a grid; test views are stored as a whole.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
@@ -122,13 +122,26 @@ pub(crate) struct Targets {
     guard_cameras: Range<u32>,
     /// Purpose of each target view.
     purposes: Vec<Purpose>,
-    /// Stride n of the training views: only every n-th column and row of pixels is stored.
-    stride: NonZeroU32,
+    strides: ViewStrides,
     /// Cache key of the target views and of what they show.
     pub(super) key: CacheKey,
     /// Scratch files, each with the range of consecutive views that it holds. A file has the color values (0 to 1 as
     /// 16-bit integers) of one view after the other.
     values: Vec<(Range<usize>, Spill)>,
+}
+
+/// Strides n of the target views: only every n-th column and row of pixels is stored. Test views are stored as a whole.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub(crate) struct ViewStrides {
+    pub(crate) training: NonZeroU32,
+    pub(crate) validation: NonZeroU32,
+}
+
+impl ViewStrides {
+    /// Returns strides with which validation views are stored as a whole.
+    pub(crate) fn with_whole_validation(training: NonZeroU32) -> ViewStrides {
+        ViewStrides { training, validation: NonZeroU32::MIN }
+    }
 }
 
 /// If [`Scene::outside`] is 1, this fraction of the new cameras of target views (renders that refinement fits) is
@@ -154,15 +167,16 @@ enum Purpose {
 
 impl Targets {
     /// Renders the views of the original that `params` asks for, fewer if they would exceed [`MAX_BYTES`]. Stores them
-    /// in a scratch file. Returns these target views. Of training views only every `stride`-th column and row of pixels
-    /// is rendered. If `has_test_views`, every fourth view is a test view; otherwise there are no test views.
+    /// in a scratch file. Returns these target views. Of training and validation views, only the columns and rows of
+    /// pixels at `strides` are rendered. If `has_test_views`, every fourth view is a test view; otherwise there are no
+    /// test views.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.
     pub(crate) fn new(
         scene: &Scene,
         params: TargetViewParams,
-        stride: NonZeroU32,
+        strides: ViewStrides,
         has_test_views: bool,
     ) -> Result<Targets> {
         let [scene_views, new_views] = params.view_counts(scene.workload().pixels);
@@ -173,8 +187,8 @@ impl Targets {
             false => purpose(k, views.len(), has_test_views),
         };
         let purposes = (0..views.len()).map(purpose).collect();
-        let key = scene.work.key(&(&cameras, &views, stride, has_test_views));
-        let targets = Targets { cameras, views, guard_cameras, purposes, stride, key, values: Vec::new() };
+        let key = scene.work.key(&(&cameras, &views, strides, has_test_views));
+        let targets = Targets { cameras, views, guard_cameras, purposes, strides, key, values: Vec::new() };
         targets.filled(NAME, scene, |_| None)
     }
 
@@ -195,6 +209,7 @@ impl Targets {
         stride: NonZeroU32,
         (seen, photographs): (Vec<FrameView>, &Photographs),
     ) -> Result<Targets> {
+        let strides = ViewStrides::with_whole_validation(stride);
         let new_views = params.renders_beside(seen.len());
         // Index in the schedule of each of the cameras that `add_new_views` lists first.
         let used = scene.schedule.used_cameras();
@@ -220,8 +235,8 @@ impl Targets {
             false => Purpose::Training,
         };
         let purposes = views.iter().map(purpose).collect();
-        let key = scene.work.key(&(&cameras, &views, stride, stamps));
-        let targets = Targets { cameras, views, guard_cameras, purposes, stride, key, values: Vec::new() };
+        let key = scene.work.key(&(&cameras, &views, strides, stamps));
+        let targets = Targets { cameras, views, guard_cameras, purposes, strides, key, values: Vec::new() };
         targets.filled(PHOTOGRAPHS_NAME, scene, |view| {
             // A view from a new camera has no photograph.
             let camera = *used.get(view.camera as usize)?;
@@ -252,7 +267,7 @@ impl Targets {
                 BatchLimits::one_frame(&scene.limits),
                 |views| {
                     let view_values = |(k, (view, renderer)): (usize, (&RenderableView<'_, 1>, &mut Renderer))| {
-                        let grid = self.grid(next + k, self.stride);
+                        let grid = self.grid(next + k, self.strides.training);
                         Ok(narrow(&match photograph(view.frame_view) {
                             Some(photograph) => sampled(&photograph?, grid),
                             None => renderer.render(view.states[0], grid.sampled_view(view.camera), scene.background),
@@ -272,7 +287,7 @@ impl Targets {
 
     /// Returns the stride n of the training views: only every n-th column and row of pixels is stored.
     pub(crate) fn stride(&self) -> NonZeroU32 {
-        self.stride
+        self.strides.training
     }
 
     /// Returns the indices of the training, validation and test views.
@@ -286,17 +301,17 @@ impl Targets {
     }
 
     /// Returns the grid of the pixels of view `k` that are rendered and compared. For a training view, these are the
-    /// pixels in every `stride`-th column and row; the first column and row come from a hash of `k`, so that different
-    /// training views sample different pixels. For validation and test views, these are all pixels. `stride` must be a
-    /// multiple of [`Targets::stride`].
+    /// pixels in every `stride`-th column and row; `stride` must be a multiple of [`Targets::stride`]. For a validation
+    /// view, the stride is that of its stored pixels. The first column and row come from a hash of `k`, so that
+    /// different views sample different pixels. Of a test view, these are all pixels.
     fn grid(&self, k: usize, stride: NonZeroU32) -> PixelGrid {
-        match self.purposes[k] {
-            Purpose::Training => {
-                let hash = hash_id(k as u64);
-                PixelGrid::new(stride, [hash as u32, (hash >> 32) as u32])
-            }
-            Purpose::Validation | Purpose::Test => PixelGrid::ALL,
-        }
+        let stride = match self.purposes[k] {
+            Purpose::Training => stride,
+            Purpose::Validation => self.strides.validation,
+            Purpose::Test => NonZeroU32::MIN,
+        };
+        let hash = hash_id(k as u64);
+        PixelGrid::new(stride, [hash as u32, (hash >> 32) as u32])
     }
 
     /// Returns the camera of target view `k` with the grid of the pixels to render. [`Targets::values`] returns the
@@ -332,20 +347,20 @@ impl Targets {
     /// # Errors
     /// Fails if the scratch file cannot be read.
     pub(crate) fn values(&self, k: usize, stride: NonZeroU32) -> Result<Vec<u16>> {
-        let len = |k: usize| 3 * self.size(k, self.stride).iter().product::<usize>();
+        let len = |k: usize| 3 * self.size(k, self.stride()).iter().product::<usize>();
         let mut values = vec![0u16; len(k)];
         for (some, spill) in self.values.iter().filter(|(some, _)| some.contains(&k)) {
             let before: usize = (some.start..k).map(len).sum();
             spill.read(2 * before as u64, bytemuck::cast_slice_mut(&mut values))?;
         }
-        let [stored, wanted] = [self.stride, stride].map(|stride| self.grid(k, stride));
+        let [stored, wanted] = [self.stride(), stride].map(|stride| self.grid(k, stride));
         if stored == wanted {
             return Ok(values);
         }
         // Position on the stored grid of the first column and row of the wanted grid.
         let first = [0, 1].map(|axis| ((wanted.pixel(axis, 0) - stored.pixel(axis, 0)) / stored.stride()) as usize);
         let step = (wanted.stride() / stored.stride()) as usize;
-        let row_len = self.size(k, self.stride)[0];
+        let row_len = self.size(k, self.stride())[0];
         let rows = values.as_chunks::<3>().0.chunks_exact(row_len.max(1)).skip(first[1]).step_by(step);
         Ok(rows.flat_map(|row| row.iter().skip(first[0]).step_by(step)).flatten().copied().collect())
     }

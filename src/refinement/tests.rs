@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use super::optimizer::RateSchedule;
 use super::optimizer_state::OptimizerState;
-use super::targets::Targets;
+use super::targets::{Targets, ViewStrides};
 use super::*;
 use crate::cache::{Cache, CacheRequest};
 use crate::compressed_model::CompressedModel;
@@ -26,6 +26,11 @@ use crate::recipe::Recipe;
 use crate::render::render;
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::source::{BlockReader, FrameSource, Ids};
+
+/// Returns the strides with which all target views are stored as a whole.
+fn whole() -> ViewStrides {
+    ViewStrides::with_whole_validation(NonZeroU32::MIN)
+}
 
 /// Keeps the first `count` Gaussians of the ranking of `scene` and refines them in `steps` steps. The Gaussians with
 /// the ids `keep` are protected (not changed). Returns the refined model and the journal of the run.
@@ -322,7 +327,7 @@ fn reading_ahead_does_not_change_steps() {
     let folder = tempfile::tempdir().unwrap();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
     for scene in explicit_and_deformed(folder.path()) {
-        let targets = Targets::new(&scene, TargetViewParams::at_most(60), NonZeroU32::MIN, false).unwrap();
+        let targets = Targets::new(&scene, TargetViewParams::at_most(60), whole(), false).unwrap();
         let kept = (0..scene.source().info().count as u32).step_by(2).collect();
         let compressed = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
         let result = scene.input.compressed_frames(&compressed).unwrap();
@@ -348,7 +353,7 @@ fn reading_ahead_does_not_change_steps() {
 fn the_optimizer_restarts_and_continues_with_a_subset() {
     let folder = tempfile::tempdir().unwrap();
     for scene in explicit_and_deformed(folder.path()) {
-        let targets = Targets::new(&scene, TargetViewParams::at_most(520), NonZeroU32::MIN, false).unwrap();
+        let targets = Targets::new(&scene, TargetViewParams::at_most(520), whole(), false).unwrap();
         let count = scene.source().info().count;
         let kept = (0..count as u32).step_by(2).collect();
         let compressed = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
@@ -393,9 +398,10 @@ fn values_at_a_stride_do_not_depend_on_the_stored_stride() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let stride = |s: u32| NonZeroU32::new(s).unwrap();
-    let all = Targets::new(&scene, TargetViewParams::at_most(60), stride(1), true).unwrap();
+    let all = Targets::new(&scene, TargetViewParams::at_most(60), whole(), true).unwrap();
     for stored in [2, 3] {
-        let targets = Targets::new(&scene, TargetViewParams::at_most(60), stride(stored), true).unwrap();
+        let strides = ViewStrides::with_whole_validation(stride(stored));
+        let targets = Targets::new(&scene, TargetViewParams::at_most(60), strides, true).unwrap();
         let split = targets.split();
         assert!(!split.training.is_empty() && !split.validation.is_empty() && !split.test.is_empty());
         for k in 0..targets.views.len() {
@@ -420,7 +426,7 @@ fn a_small_weight_of_the_outside_gives_guard_views() {
     let mut scene = scene(folder.path());
     let scene_cameras = scene.schedule.cameras.len();
     let guards = |scene: &Scene| {
-        let targets = Targets::new(scene, TargetViewParams::at_most(500), NonZeroU32::MIN, false).unwrap();
+        let targets = Targets::new(scene, TargetViewParams::at_most(500), whole(), false).unwrap();
         (0..targets.views.len()).filter(|&k| targets.is_guard(k)).count()
     };
     assert_eq!(guards(&scene), 0);
@@ -446,7 +452,7 @@ fn without_new_cameras_all_target_views_are_from_the_scene() {
     let scene = scene(folder.path());
     let cameras = |between| {
         let params = TargetViewParams { between, ..TargetViewParams::at_most(500) };
-        Targets::new(&scene, params, NonZeroU32::MIN, false).unwrap().cameras.len()
+        Targets::new(&scene, params, whole(), false).unwrap().cameras.len()
     };
     assert_eq!(cameras(false), scene.schedule.used_cameras().len());
     assert!(cameras(true) > cameras(false) + 100);
@@ -486,6 +492,9 @@ fn strides_leave_enough_pixels_per_gaussian() {
     assert_eq!([stride(1_370_928, 60_000), stride(1_370_928, 20_000)], [3, 4]);
     assert_eq!([stride(0, 10), stride(100, 0), stride(u64::MAX, 1)], [1, 4, 4]);
     // Values are stored for a third of the first survivors, because prune steps will remove most.
-    assert_eq!(refine.stored_stride(82_944, 8354).get(), stride(82_944, 8354 / 3));
-    assert_eq!(refine.stored_stride(82_944, 8354).get(), 3);
+    let stored = refine.stored_strides(82_944, 8354);
+    assert_eq!(stored.training.get(), stride(82_944, 8354 / 3));
+    assert_eq!([stored.training, stored.validation].map(NonZeroU32::get), [3, 2]);
+    let with_ssim = RefineStage { loss: Loss { ssim: 0.5 }, ..refine }.stored_strides(82_944, 8354);
+    assert_eq!([with_ssim.training, with_ssim.validation], [NonZeroU32::MIN; 2]);
 }

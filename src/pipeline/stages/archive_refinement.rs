@@ -108,8 +108,8 @@ impl<'a> ArchiveRefinement<'a> {
         if scene.schedule.pair_count() == 0 {
             return Ok(None);
         }
-        let stride = refine.stored_stride(scene.workload().pixels, compressed.len());
-        let targets = Targets::new(scene, refine.target_views, stride, has_test_views)?;
+        let strides = refine.stored_strides(scene.workload().pixels, compressed.len());
+        let targets = Targets::new(scene, refine.target_views, strides, has_test_views)?;
         let mut views = targets.split();
         let is_compared = |k: usize| {
             let is_same = |view: &FrameView| {

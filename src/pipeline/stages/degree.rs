@@ -84,12 +84,12 @@ impl Degree {
         let gaussian_count = scored.gaussian_count();
         let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
         journal.run_cached_stage(NAME, gaussian_count, scene, key, |journal| {
-            let counts = CountPlan { prunes_in_refinement: self.refine.prunes, searches: false };
+            let counts = CountPlan { max_start: self.refine.prunes.then_some(self.refine.max_start), searches: false };
             let initial_count =
                 |gaussians: usize| counts.count_before_refinement(gaussians, gaussian_count).min(ranked.order().len());
             let largest = fits.iter().map(|fit| initial_count(fit.gaussians)).max().unwrap_or_default();
-            let stride = self.refine.stored_stride(scene.workload().pixels, largest);
-            let targets = Targets::new(scene, self.refine.target_views, stride, false)?;
+            let strides = self.refine.stored_strides(scene.workload().pixels, largest);
+            let targets = Targets::new(scene, self.refine.target_views, strides, false)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
                 let start = CompressedModel {

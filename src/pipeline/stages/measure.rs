@@ -20,6 +20,9 @@ use crate::recipe::{Coverage, Recipe, ScanFrames};
 use crate::scene::Scene;
 use crate::statistics::pass::{ScanResult, scan_units};
 
+/// Maximum number of views by which the visible contributions are measured if no decision depends on them.
+const PRELIMINARY_VIEWS: usize = 16;
+
 /// Adds to `stages` the stages that compute the statistics of the Gaussians and score them. Records why the visible
 /// contribution is not measured if there are no cameras for it.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
@@ -57,6 +60,10 @@ impl MeasureStages {
             && Rounds::from_recipe(&recipe.select, planning.target_fraction()).is_some();
         if let Some(visible) = &mut measure.visible {
             visible.is_preliminary = measure.scan.can_be_partial;
+            // Unless Gaussians are merged by their scores, these views only show whether the cameras see the scene.
+            if visible.is_preliminary && !planning.merges && visible.recipe.scoring_views > 0 {
+                visible.recipe.scoring_views = visible.recipe.scoring_views.min(PRELIMINARY_VIEWS);
+            }
         }
         measure
     }

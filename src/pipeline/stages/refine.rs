@@ -12,7 +12,10 @@ use crate::scene::Scene;
 /// Adds the refinement stage to `stages` if the recipe asks for refinement and the memory limit allows it. Records the
 /// parts of refinement that are omitted for lack of memory.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
-    for (what, bytes) in planning.fallback.left_out() {
+    let has_smaller_start = planning.refine.as_ref().is_some_and(RefineStage::has_smaller_start);
+    let start = planning.fallback.required_bytes().filter(|_| has_smaller_start);
+    let start = start.map(|bytes| ("more Gaussians at the start of refinement", bytes));
+    for (what, bytes) in start.into_iter().chain(planning.fallback.left_out()) {
         let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));
         stages.leave_out(what, why);
     }

@@ -19,12 +19,12 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{REMOVAL_COST, ResourceEstimate, Workload};
 use crate::model::{Attributes, FrameView};
-use crate::passes::select_evenly_over_frames;
+use crate::passes::{pixel_stride, select_evenly_over_frames};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Progress;
 use crate::pruning::Ranking;
-use crate::pruning::removal::{ranking_stride, removal_error};
+use crate::pruning::removal::removal_error;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
@@ -47,6 +47,9 @@ pub(crate) struct Rounds {
     /// color behind it (norm over red, green and blue, each from 0 to 1). Otherwise a Gaussian with the color of its
     /// background would have a removal error of 0.
     pub contrast_floor: f64,
+    /// Wanted number of rendered pixels of a view per Gaussian of the input. It determines the stride of the rendered
+    /// pixels. More pixels would change the ranking less than other views would.
+    pub pixels_per_gaussian: f64,
     /// Smallest fraction of the Gaussians of the input that the last pruning round may leave, as assumed in estimates.
     /// It bounds the number of pruning rounds.
     pub fewest: f64,
@@ -54,6 +57,11 @@ pub(crate) struct Rounds {
     pub usual: f64,
 }
 
+/// Value of [`Rounds::pixels_per_gaussian`] if the ranking alone decides which Gaussians stay. With 1 pixel, three
+/// trained scenes have the same quality at 60 and 30% kept; with 0.35 they have 0.1 to 0.3 dB less.
+const PIXELS_PER_GAUSSIAN: f64 = 0.5;
+/// Value of [`Rounds::pixels_per_gaussian`] if refinement follows, which makes up for the difference.
+const PIXELS_BEFORE_REFINEMENT: f64 = 0.35;
 /// Value of [`Rounds::fewest`] (smallest fraction of the Gaussians that the last pruning round is assumed to leave) if
 /// the user requests no number of Gaussians.
 const MIN_LEFT: f64 = 0.05;
@@ -65,7 +73,10 @@ const USUAL_LEFT: f64 = 0.5;
 /// views and the recipe asks for several rounds.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let rounds = Rounds::from_recipe(&planning.request.recipe.select, planning.target_fraction());
-    if let Some(rounds) = rounds.filter(|_| planning.prunes_by_views()) {
+    if let Some(mut rounds) = rounds.filter(|_| planning.prunes_by_views()) {
+        if planning.refine.is_some() {
+            rounds.pixels_per_gaussian = PIXELS_BEFORE_REFINEMENT;
+        }
         stages.add(Phase::Rank, rounds);
     }
 }
@@ -110,7 +121,9 @@ impl Rounds {
             ..
         } = *recipe;
         let (fewest, usual) = (target.unwrap_or(MIN_LEFT), target.unwrap_or(USUAL_LEFT));
-        (fraction < 1.0).then_some(Rounds { fraction, views, groups, contrast_floor, fewest, usual })
+        let pixels_per_gaussian = PIXELS_PER_GAUSSIAN;
+        let rounds = Rounds { fraction, views, groups, contrast_floor, pixels_per_gaussian, fewest, usual };
+        (fraction < 1.0).then_some(rounds)
     }
 
     /// Returns the resource estimate of the stage. Its memory holds the ranking, the measured removal errors, and the
@@ -198,7 +211,7 @@ impl Rounds {
         let groups = self.view_groups(scene, scored);
         state.errors = vec![vec![0; scored.gaussian_count()]; groups.len()];
         // All rounds use the same pixels, because a round adds errors that earlier rounds measured.
-        let stride = ranking_stride(scene.workload().pixels, first);
+        let stride = pixel_stride(scene.workload().pixels, self.pixels_per_gaussian * first as f64);
         // The key does not depend on `fewest`, because the survivors of a round do not.
         let key = scene.work.key(&(self.fraction, self.contrast_floor, &groups, &before, protected, stride));
         let mut done = 0;
