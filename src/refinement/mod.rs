@@ -58,18 +58,18 @@ const STEP_RENDERS: f64 = 3.0;
 /// about a quarter of an 8-bit step.
 pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
 /// Refinement to the fraction k of all Gaussians begins with the fraction `START_FACTOR` · √k, if that is more. Ranking
-/// alone chooses the Gaussians at the beginning; prune steps between optimization steps then remove more of them. With
-/// optimized survivors, a ranking is better, but every step with more Gaussians takes longer.
+/// alone chooses the Gaussians at the beginning; prune steps between optimization steps then remove more of them. They
+/// choose better, because they rank optimized Gaussians and protect neighbors, but steps with more Gaussians take longer.
 const START_FACTOR: f64 = 0.95;
 /// Largest fraction of all Gaussians with which refinement begins, unless more are to stay, if there is little memory.
 const SMALL_START: f64 = 0.4;
-/// Largest fraction of all Gaussians for which there are as many final steps as [`RefineStage::steps`] says, but for
-/// the factor of [`STEP_COST_POWER`]. If more stay, less has to be made up for.
+/// If more than this fraction of all Gaussians stay, there are fewer final steps, in proportion to the fraction removed:
+/// less has to be made up for.
 const FULL_STEPS_FRACTION: f64 = 0.4;
-/// Fraction of all Gaussians above which there are fewer final steps, because each takes longer.
+/// If more than this fraction of all Gaussians stay, there are fewer final steps, because each takes longer.
 const CHEAP_STEPS_FRACTION: f64 = 0.1;
-/// For the fraction k of all Gaussians, above [`CHEAP_STEPS_FRACTION`], the number of final steps has the factor
-/// ([`CHEAP_STEPS_FRACTION`] / k) to this power.
+/// If the fraction k of all Gaussians stays, the number of final steps has the factor ([`CHEAP_STEPS_FRACTION`] / k) to
+/// this power, at most 1.
 const STEP_COST_POWER: f64 = 0.25;
 /// Approximate number of pixels of a validation view that are rendered and compared. Validation views of more pixels
 /// are rendered at a stride.
