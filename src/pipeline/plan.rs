@@ -188,12 +188,14 @@ impl RunPlan {
             fallback,
         };
         let refine = RefineStage::from_recipe(recipe, planning.target_fraction(), planning.prunes_by_views());
+        // Without a target the memory is that of all Gaussians, so a smaller start saves nothing.
+        let starts_smaller = fallback != MemoryFallback::Nothing && target.is_some();
+        let refine = refine.map(|refine| if starts_smaller { refine.with_small_start() } else { refine });
         planning.refine = refine.and_then(|refine| match fallback {
-            MemoryFallback::Nothing => Some(refine),
-            MemoryFallback::SmallStart { .. } => Some(refine.with_small_start()),
-            MemoryFallback::ConstantInTime { .. } => Some(refine.with_small_start().with_time_independent_deltas()),
+            MemoryFallback::Nothing | MemoryFallback::SmallStart { .. } => Some(refine),
+            MemoryFallback::ConstantInTime { .. } => Some(refine.with_time_independent_deltas()),
             MemoryFallback::WithoutHarmonics { .. } => {
-                Some(refine.with_small_start().with_time_independent_deltas().with_fixed_higher_sh())
+                Some(refine.with_time_independent_deltas().with_fixed_higher_sh())
             }
             MemoryFallback::WithoutRefinement { .. } => None,
         });
@@ -432,7 +434,13 @@ mod tests {
             );
             (plan.fallback, plan.refine.map(|refine| refine.sh_degree), time.filter(|_| bands.is_none()).or(bands), all)
         };
-        let least = |spared: MemoryFallback| spared.required_bytes().unwrap_or_default();
+        let least = |spared: MemoryFallback| match spared {
+            MemoryFallback::SmallStart { required_bytes }
+            | MemoryFallback::ConstantInTime { required_bytes }
+            | MemoryFallback::WithoutHarmonics { required_bytes }
+            | MemoryFallback::WithoutRefinement { required_bytes } => required_bytes,
+            MemoryFallback::Nothing => 0,
+        };
         let full_bytes = MemoryPlan::closest(work, 1, all_estimates("default")).peak_bytes();
         assert_eq!(within(full_bytes).0, MemoryFallback::Nothing);
         let (spared, degree, named, none) = within(full_bytes - 1);

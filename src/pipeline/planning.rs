@@ -139,18 +139,6 @@ pub(crate) enum MemoryFallback {
 }
 
 impl MemoryFallback {
-    /// Returns the smallest memory limit, bytes, with which the part of refinement that was omitted last would be
-    /// included; `None` if no part is omitted.
-    pub(super) fn required_bytes(self) -> Option<u64> {
-        match self {
-            MemoryFallback::Nothing => None,
-            MemoryFallback::SmallStart { required_bytes }
-            | MemoryFallback::ConstantInTime { required_bytes }
-            | MemoryFallback::WithoutHarmonics { required_bytes }
-            | MemoryFallback::WithoutRefinement { required_bytes } => Some(required_bytes),
-        }
-    }
-
     /// Returns the names of the omitted parts of refinement, except of Gaussians at its start, each with the smallest
     /// memory limit, bytes, with which it would be included.
     pub(super) fn left_out(self) -> Vec<(&'static str, u64)> {

@@ -162,7 +162,7 @@ impl SearchStage {
         need.fixed.push(("compared images", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
         need.fixed.push(("field", work.input.fixed));
         // Each prune step removes a fifth of the Gaussians. So the models that are kept after prune steps have together
-        // up to about three times as many Gaussians as the input.
+        // less than four times as many Gaussians as the model from which they are made.
         need.per_gaussian.extend([
             ("search models", 4 * (whole + 8)),
             ("result", work.input.compressed),

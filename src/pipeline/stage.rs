@@ -29,7 +29,7 @@ use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
 /// In a run that searches for the smallest model with a requested quality, the last pruning round leaves as many
-/// Gaussians as a target of this fraction of the Gaussians needs.
+/// Gaussians as in a run with this fraction of the Gaussians as the target.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
 
 /// Phase of a run to which a stage belongs.
@@ -201,11 +201,11 @@ impl CountPlan {
                 )
             }
             (Some(target_count), false) => format!("counts: {alone} {}; refinement removes none", share(target_count)),
-            (None, true) => format!(
-                "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found \
-                 during the run",
-                share(self.count_before_refinement(0, input_count))
-            ),
+            (None, true) => {
+                "counts: ranking leaves more than are to stay, refinement removes the rest; the number that \
+                             stays is found during the run"
+                    .to_owned()
+            }
             (None, false) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
         }
     }

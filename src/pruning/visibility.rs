@@ -17,6 +17,8 @@ use crate::scene::Scene;
 
 /// Name of this stage in messages and in the cache.
 pub(crate) const NAME: &str = "visible";
+/// Maximum number of views if no decision depends on the contributions ([`VisibilityStage::decides_nothing`]).
+const FEW_VIEWS: usize = 16;
 
 /// Stage that renders views to measure the contribution C of every Gaussian (Σ alpha · transmittance over the pixels of
 /// a view, averaged over views) and its peak W (maximum in one pixel).
@@ -28,6 +30,10 @@ pub struct VisibilityStage {
     /// Whether pruning rounds will rank the Gaussians again. If so, this stage renders only every n-th column and row of
     /// pixels, so that there is about one pixel per Gaussian.
     pub is_preliminary: bool,
+    /// Whether the contributions only show that the cameras see the scene, and order the Gaussians that no view of the
+    /// pruning rounds shows. If so, this stage renders at most [`FEW_VIEWS`] views, or one for each frame that is needed
+    /// to see all Gaussians.
+    pub decides_nothing: bool,
 }
 
 impl VisibilityStage {
@@ -40,7 +46,7 @@ impl VisibilityStage {
             Coverage::Visible => true,
             Coverage::Projected => false,
         };
-        looks.then(|| VisibilityStage { recipe: recipe.clone(), is_preliminary: false })
+        looks.then(|| VisibilityStage { recipe: recipe.clone(), is_preliminary: false, decides_nothing: false })
     }
 
     /// Estimates the memory and time that this stage needs for the input `work`. Memory holds the statistics of the
@@ -93,7 +99,11 @@ impl VisibilityStage {
         let source = scene.source();
         let count = source.info().count;
         let frames = frames_needed_to_see_all(life, source.info().times.len());
-        let views = scoring_views(&scene.schedule, &self.recipe, frames);
+        let mut recipe = self.recipe.clone();
+        if self.decides_nothing {
+            recipe.scoring_views = recipe.scoring_views.min(frames.max(FEW_VIEWS));
+        }
+        let views = scoring_views(&scene.schedule, &recipe, frames);
         let stride = self.pixel_stride(scene.workload().pixels, count);
         let cameras = &scene.schedule.cameras[..];
         let look = |range: Range<usize>| {

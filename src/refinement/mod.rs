@@ -57,9 +57,10 @@ const STEP_RENDERS: f64 = 3.0;
 /// Validation PSNR in dB at or above which refinement is skipped as useless: the root mean square error is then at most
 /// about a quarter of an 8-bit step.
 pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
-/// Refinement to the fraction k of all Gaussians begins with the fraction `START_FACTOR` · √k, if that is more. Ranking
-/// alone chooses the Gaussians at the beginning; prune steps between optimization steps then remove more of them. They
-/// choose better, because they rank optimized Gaussians and protect neighbors, but steps with more Gaussians take longer.
+/// Refinement to the fraction k of all Gaussians begins with the fraction `START_FACTOR` · √k, or with k if that is
+/// more. Ranking alone chooses the Gaussians at the beginning; prune steps between optimization steps then remove more of
+/// them. Prune steps choose better than the ranking, because they rank optimized Gaussians and protect neighbors, but
+/// steps with more Gaussians take longer.
 const START_FACTOR: f64 = 0.95;
 /// Largest fraction of all Gaussians with which refinement begins, unless more are to stay, if there is little memory.
 const SMALL_START: f64 = 0.4;
@@ -71,8 +72,8 @@ const CHEAP_STEPS_FRACTION: f64 = 0.1;
 /// If the fraction k of all Gaussians stays, the number of final steps has the factor ([`CHEAP_STEPS_FRACTION`] / k) to
 /// this power, at most 1.
 const STEP_COST_POWER: f64 = 0.25;
-/// Approximate number of pixels of a validation view that are rendered and compared. Validation views of more pixels
-/// are rendered at a stride.
+/// Minimum number of pixels of a validation view that are rendered and compared, if the view has as many. The stride of
+/// its pixels is rounded down, so there may be up to four times as many; it is at most 4.
 const VALIDATION_PIXELS: f64 = 20_000.0;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_KEPT_FRACTION: f64 = 0.8;
@@ -179,9 +180,8 @@ impl RefineStage {
     /// Returns whether this stage may begin with fewer Gaussians than it would without the limit
     /// [`RefineStage::max_start`].
     pub(crate) fn has_smaller_start(&self) -> bool {
-        let is_limited =
-            self.target.is_none_or(|target| start_fraction(target, self.max_start) < start_fraction(target, 1.0));
-        self.prunes && self.max_start < 1.0 && is_limited
+        let is_limited = |target| start_fraction(target, self.max_start) < start_fraction(target, 1.0);
+        self.prunes && self.target.is_some_and(is_limited)
     }
 
     /// Returns the fraction of all Gaussians with which this stage begins, if it ends with the fraction `target`.
@@ -204,7 +204,7 @@ impl RefineStage {
 
     /// Returns the cache key of the parameters of this stage. It does not depend on the input.
     pub(crate) fn key(&self) -> CacheKey {
-        let step_settings = (self.steps, self.steps_per_prune, self.prunes, self.keyframes);
+        let step_settings = (self.steps, self.steps_per_prune, self.prunes, self.max_start, self.keyframes);
         let view_settings = (self.target_views, self.validates, self.contrast_floor);
         CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, step_settings, view_settings))
     }
@@ -222,8 +222,17 @@ impl RefineStage {
         ViewStrides { training: self.stride(pixels, fewer), validation: self.validation_stride(pixels) }
     }
 
+    /// Returns the stride at which the training views are stored for the input `work`, if refinement begins with `first`
+    /// Gaussians. In a search, which has no target, it is that of all Gaussians.
+    fn stored_training_stride(&self, work: &Workload, first: f64) -> NonZeroU32 {
+        match self.target {
+            Some(_) => self.stored_strides(work.pixels, first as usize).training,
+            None => self.stride(work.pixels, work.gaussian_count() as usize),
+        }
+    }
+
     /// Returns the stride of the validation views, which have `pixels` pixels each: 1 if SSIM is part of the loss,
-    /// otherwise such that about [`VALIDATION_PIXELS`] are left.
+    /// otherwise such that at least [`VALIDATION_PIXELS`] are left.
     fn validation_stride(&self, pixels: u64) -> NonZeroU32 {
         if self.loss.ssim > 0.0 { NonZeroU32::MIN } else { pixel_stride(pixels, VALIDATION_PIXELS) }
     }
@@ -341,8 +350,9 @@ impl RefineStage {
                 + strided.render_seconds(ranked, count, REMOVAL_COST)
         };
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
-        let stored = work.on_grid(self.stored_strides(work.pixels, first as usize).training);
-        // Whole views are rendered for validation, `together` at a time, with 6 bytes per pixel of the target view.
+        let stored = work.on_grid(self.stored_training_stride(work, first));
+        // Validation and test views may be whole. `together` of them are rendered at a time, with 6 bytes per pixel of
+        // the target view.
         // Steps render pixels of a grid, and hold the image, its gradient and the target views of two steps.
         let whole_views = together * 24 * work.pixels;
         let views_of_steps = (work.threads + 4) * 12 * stored.pixels;

@@ -11,23 +11,25 @@ use crate::journal::Journal;
 /// number.
 pub struct PrunedModels<'a> {
     refinement: RefineRun<'a>,
-    /// Models between two prune steps, from the largest to the smallest. A model that already has the requested number
-    /// of Gaussians is not stored.
+    /// Models between two prune steps, from the largest to the smallest, all made from one model. A model that already
+    /// has the requested number of Gaussians is not stored.
     models: Vec<CompressedModel>,
+    /// Number of Gaussians of the model from which `models` were made.
+    first: usize,
 }
 
 impl<'a> PrunedModels<'a> {
     /// Creates an empty collection of models. [`PrunedModels::refined`] adds models to it, which it makes by the
     /// optimization and prune steps of `refinement`.
     pub(crate) fn new(refinement: RefineRun<'a>) -> PrunedModels<'a> {
-        PrunedModels { refinement, models: Vec::new() }
+        PrunedModels { refinement, models: Vec::new(), first: 0 }
     }
 
     /// Returns a refined model of `size` Gaussians. Prunes a larger model by optimization and prune steps, then runs
     /// the final optimization steps. Pruning begins with the smallest model stored by earlier calls that has at least
-    /// `size` Gaussians. If there is none, or if `start` has at most `size` Gaussians, it begins with `start`: the
-    /// model of the Gaussians that ranking keeps, before any prune step. Notes for the user are added to `journal`, the
-    /// record of the run.
+    /// `size` Gaussians, if these calls began with at least as many Gaussians as `start` has. Otherwise it begins with
+    /// `start`: the model of the Gaussians that ranking keeps, before any prune step; models stored earlier are then
+    /// dropped. Notes for the user are added to `journal`, the record of the run.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -37,8 +39,10 @@ impl<'a> PrunedModels<'a> {
         size: usize,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let first = start.len();
-        let before = self.models.iter().rfind(|model| first > size && model.len() >= size);
+        if start.len() > self.first {
+            (self.first, self.models) = (start.len(), Vec::new());
+        }
+        let before = self.models.iter().rfind(|model| start.len() > size && model.len() >= size);
         let mut model = before.cloned().unwrap_or(start);
         while model.len() > size {
             let next = next_size(model.len(), size);

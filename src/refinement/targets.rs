@@ -130,7 +130,8 @@ pub(crate) struct Targets {
     values: Vec<(Range<usize>, Spill)>,
 }
 
-/// Strides n of the target views: only every n-th column and row of pixels is stored. Test views are stored as a whole.
+/// Strides n of the target views: only every n-th column and row of pixels is stored. Test views are stored as a whole,
+/// and so are the validation views of a search and of a fit to photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub(crate) struct ViewStrides {
     pub(crate) training: NonZeroU32,

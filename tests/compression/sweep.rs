@@ -95,7 +95,7 @@ fn refinement_step_points_equal_compress() {
     assert_eq!(knob["parameter"], "refine_steps");
     let settings = knob["settings"].as_array().unwrap();
     assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
-    // Before the last prune step there are 260 of 1300 steps, as in the preset: 25 · 260/1300.
+    // The preset has 260 steps per prune step for 1300 final steps, so 25 final steps have 25 · 260/1300 = 5.
     workplace.done(
         "compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_steps_per_prune=5",
     );

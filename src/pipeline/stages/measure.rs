@@ -20,16 +20,13 @@ use crate::recipe::{Coverage, Recipe, ScanFrames};
 use crate::scene::Scene;
 use crate::statistics::pass::{ScanResult, scan_units};
 
-/// Maximum number of views by which the visible contributions are measured if no decision depends on them.
-const PRELIMINARY_VIEWS: usize = 16;
-
 /// Adds to `stages` the stages that compute the statistics of the Gaussians and score them. Records why the visible
 /// contribution is not measured if there are no cameras for it.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let scan = &planning.request.recipe.scan;
     if scan.coverage == Coverage::Auto && !planning.input.has_cameras {
         let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
-        let visible = VisibilityStage { recipe: scan.clone(), is_preliminary: false };
+        let visible = VisibilityStage { recipe: scan.clone(), is_preliminary: false, decides_nothing: false };
         stages.leave_out_stage("visible coverage", why, move |work, limits| visible.resource_estimate(work, limits));
     }
     stages.add(Phase::Rank, MeasureStages::from_planning(planning));
@@ -60,10 +57,8 @@ impl MeasureStages {
             && Rounds::from_recipe(&recipe.select, planning.target_fraction()).is_some();
         if let Some(visible) = &mut measure.visible {
             visible.is_preliminary = measure.scan.can_be_partial;
-            // Unless Gaussians are merged by their scores, these views only show whether the cameras see the scene.
-            if visible.is_preliminary && !planning.merges && visible.recipe.scoring_views > 0 {
-                visible.recipe.scoring_views = visible.recipe.scoring_views.min(PRELIMINARY_VIEWS);
-            }
+            // Unless Gaussians are merged in the order of their scores.
+            visible.decides_nothing = visible.is_preliminary && !planning.merges;
         }
         measure
     }
@@ -111,8 +106,9 @@ impl MeasureStages {
     pub fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         scene.set_excluded_ids(&[]);
         let ScoreStage { snap_noise, non_finite, score, select, user, .. } = &self.score;
+        let visible = self.visible.as_ref().map(|visible| (visible.is_preliminary, visible.decides_nothing));
         let key = scene.work.key(&(
-            (&self.scan.recipe, self.scan.can_be_partial, self.visible.is_some(), snap_noise, non_finite, score, user),
+            (&self.scan.recipe, self.scan.can_be_partial, visible, snap_noise, non_finite, score, user),
             (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),
         ));
         let scored =

@@ -3,7 +3,7 @@
 
 use crate::error::Result;
 use crate::memory_plan::ResourceEstimate;
-use crate::pipeline::planning::Planning;
+use crate::pipeline::planning::{MemoryFallback, Planning};
 use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::refinement::RefineStage;
 use crate::refinement::targets;
@@ -12,16 +12,24 @@ use crate::scene::Scene;
 /// Adds the refinement stage to `stages` if the recipe asks for refinement and the memory limit allows it. Records the
 /// parts of refinement that are omitted for lack of memory.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
-    let has_smaller_start = planning.refine.as_ref().is_some_and(RefineStage::has_smaller_start);
-    let start = planning.fallback.required_bytes().filter(|_| has_smaller_start);
-    let start = start.map(|bytes| ("more Gaussians at the start of refinement", bytes));
-    for (what, bytes) in start.into_iter().chain(planning.fallback.left_out()) {
-        let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));
-        stages.leave_out(what, why);
+    if planning.refine.as_ref().is_some_and(RefineStage::has_smaller_start) {
+        let why = match planning.fallback {
+            MemoryFallback::SmallStart { required_bytes } => memory_reason(required_bytes),
+            _ => "memory: they do not fit within the limit (--memory)".to_owned(),
+        };
+        stages.leave_out("more Gaussians at the start of refinement", why);
+    }
+    for (what, bytes) in planning.fallback.left_out() {
+        stages.leave_out(what, memory_reason(bytes));
     }
     if let Some(refine) = &planning.refine {
         stages.add(Phase::Reduce, refine.clone());
     }
+}
+
+/// Returns the reason why a part of refinement is left out that needs a memory limit of at least `bytes`.
+fn memory_reason(bytes: u64) -> String {
+    format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20))
 }
 
 impl Stage for RefineStage {
