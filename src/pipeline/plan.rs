@@ -209,10 +209,7 @@ impl RunPlan {
         plan.search = SearchStage::from_planning(&planning);
         plan.output = Some(WriteStage::from_planning(&planning));
         plan.target = target;
-        plan.stages.counts = CountPlan {
-            max_start: planning.refine.as_ref().and_then(|refine| refine.prunes.then_some(refine.max_start)),
-            searches: plan.search.is_some(),
-        };
+        plan.stages.counts = CountPlan::new(planning.refine.as_ref(), plan.search.is_some());
         (plan.merges, plan.refine, plan.fallback) = (planning.merges, planning.refine.clone(), fallback);
         STAGES.iter().for_each(|add| add(&planning, &mut plan.stages));
         Ok(plan)

@@ -139,8 +139,8 @@ pub(crate) enum MemoryFallback {
 }
 
 impl MemoryFallback {
-    /// Returns the names of the omitted parts of refinement, except of Gaussians at its start, each with the smallest
-    /// memory limit, bytes, with which it would be included.
+    /// Returns the names of the omitted parts of refinement, each with the smallest memory limit, bytes, with which it
+    /// would be included. Leaves out that refinement begins with fewer Gaussians, because this depends on the target.
     pub(super) fn left_out(self) -> Vec<(&'static str, u64)> {
         match self {
             MemoryFallback::Nothing | MemoryFallback::SmallStart { .. } => Vec::new(),

@@ -24,7 +24,7 @@ use crate::pruning::Ranking;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score::Scored;
 use crate::refinement::prune_steps::PrunedModels;
-use crate::refinement::start_count;
+use crate::refinement::{RefineStage, start_count};
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
@@ -160,14 +160,17 @@ pub struct CompressedScene {
 pub struct CountPlan {
     /// Largest fraction of the Gaussians with which refinement begins ([`RefineStage::max_start`]), if it removes
     /// Gaussians in prune steps until the target is reached. `None` if only ranking removes Gaussians.
-    ///
-    /// [`RefineStage::max_start`]: crate::refinement::RefineStage::max_start
     pub max_start: Option<f64>,
     /// Whether the run searches for the number of Gaussians in the output.
     pub searches: bool,
 }
 
 impl CountPlan {
+    /// Creates the plan of a run with the refinement stage `refine`, if any. `searches`: as in [`CountPlan::searches`].
+    pub fn new(refine: Option<&RefineStage>, searches: bool) -> CountPlan {
+        CountPlan { max_start: refine.and_then(|refine| refine.prunes.then_some(refine.max_start)), searches }
+    }
+
     /// Returns the number of Gaussians with which refinement begins. `target_count`: number of Gaussians in the output.
     /// `input_count`: number of Gaussians in the input.
     pub fn count_before_refinement(&self, target_count: usize, input_count: usize) -> usize {

@@ -17,7 +17,7 @@ use crate::scene::Scene;
 
 /// Name of this stage in messages and in the cache.
 pub(crate) const NAME: &str = "visible";
-/// Maximum number of views if no decision depends on the contributions ([`VisibilityStage::decides_nothing`]).
+/// Maximum number of views of a stage that needs few of them ([`VisibilityStage::needs_few_views`]).
 const FEW_VIEWS: usize = 16;
 
 /// Stage that renders views to measure the contribution C of every Gaussian (Σ alpha · transmittance over the pixels of
@@ -31,9 +31,9 @@ pub struct VisibilityStage {
     /// pixels, so that there is about one pixel per Gaussian.
     pub is_preliminary: bool,
     /// Whether the contributions only show that the cameras see the scene, and order the Gaussians that no view of the
-    /// pruning rounds shows. If so, this stage renders at most [`FEW_VIEWS`] views, or one for each frame that is needed
-    /// to see all Gaussians.
-    pub decides_nothing: bool,
+    /// pruning rounds shows. If so, this stage renders at most [`FEW_VIEWS`] views, or as many as there are frames needed
+    /// to see all Gaussians, if these are more.
+    pub needs_few_views: bool,
 }
 
 impl VisibilityStage {
@@ -46,7 +46,7 @@ impl VisibilityStage {
             Coverage::Visible => true,
             Coverage::Projected => false,
         };
-        looks.then(|| VisibilityStage { recipe: recipe.clone(), is_preliminary: false, decides_nothing: false })
+        looks.then(|| VisibilityStage { recipe: recipe.clone(), is_preliminary: false, needs_few_views: false })
     }
 
     /// Estimates the memory and time that this stage needs for the input `work`. Memory holds the statistics of the
@@ -99,10 +99,9 @@ impl VisibilityStage {
         let source = scene.source();
         let count = source.info().count;
         let frames = frames_needed_to_see_all(life, source.info().times.len());
-        let mut recipe = self.recipe.clone();
-        if self.decides_nothing {
-            recipe.scoring_views = recipe.scoring_views.min(frames.max(FEW_VIEWS));
-        }
+        let max_views = if self.needs_few_views { frames.max(FEW_VIEWS) } else { usize::MAX };
+        let recipe =
+            recipe::ScanParams { scoring_views: self.recipe.scoring_views.min(max_views), ..self.recipe.clone() };
         let views = scoring_views(&scene.schedule, &recipe, frames);
         let stride = self.pixel_stride(scene.workload().pixels, count);
         let cameras = &scene.schedule.cameras[..];

@@ -72,8 +72,7 @@ const CHEAP_STEPS_FRACTION: f64 = 0.1;
 /// If the fraction k of all Gaussians stays, the number of final steps has the factor ([`CHEAP_STEPS_FRACTION`] / k) to
 /// this power, at most 1.
 const STEP_COST_POWER: f64 = 0.25;
-/// Minimum number of pixels of a validation view that are rendered and compared, if the view has as many. The stride of
-/// its pixels is rounded down, so there may be up to four times as many; it is at most 4.
+/// A validation view is rendered at the largest stride, from 1 to 4, that leaves at least this many of its pixels.
 const VALIDATION_PIXELS: f64 = 20_000.0;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_KEPT_FRACTION: f64 = 0.8;
@@ -223,7 +222,7 @@ impl RefineStage {
     }
 
     /// Returns the stride at which the training views are stored for the input `work`, if refinement begins with `first`
-    /// Gaussians. In a search, which has no target, it is that of all Gaussians.
+    /// Gaussians. A search, which has no target, stores them at the stride for all Gaussians.
     fn stored_training_stride(&self, work: &Workload, first: f64) -> NonZeroU32 {
         match self.target {
             Some(_) => self.stored_strides(work.pixels, first as usize).training,
@@ -231,8 +230,8 @@ impl RefineStage {
         }
     }
 
-    /// Returns the stride of the validation views, which have `pixels` pixels each: 1 if SSIM is part of the loss,
-    /// otherwise such that at least [`VALIDATION_PIXELS`] are left.
+    /// Returns the stride of validation views with `pixels` pixels. It leaves at least [`VALIDATION_PIXELS`], and is 1 if
+    /// SSIM is part of the loss.
     fn validation_stride(&self, pixels: u64) -> NonZeroU32 {
         if self.loss.ssim > 0.0 { NonZeroU32::MIN } else { pixel_stride(pixels, VALIDATION_PIXELS) }
     }
@@ -352,8 +351,8 @@ impl RefineStage {
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
         let stored = work.on_grid(self.stored_training_stride(work, first));
         // Validation and test views may be whole. `together` of them are rendered at a time, with 6 bytes per pixel of
-        // the target view.
-        // Steps render pixels of a grid, and hold the image, its gradient and the target views of two steps.
+        // the target view. Steps render pixels of a grid, and hold the image, its gradient and the target views of two
+        // steps.
         let whole_views = together * 24 * work.pixels;
         let views_of_steps = (work.threads + 4) * 12 * stored.pixels;
         ResourceEstimate {

@@ -26,10 +26,10 @@ impl<'a> PrunedModels<'a> {
     }
 
     /// Returns a refined model of `size` Gaussians. Prunes a larger model by optimization and prune steps, then runs
-    /// the final optimization steps. Pruning begins with the smallest model stored by earlier calls that has at least
-    /// `size` Gaussians, if these calls began with at least as many Gaussians as `start` has. Otherwise it begins with
-    /// `start`: the model of the Gaussians that ranking keeps, before any prune step; models stored earlier are then
-    /// dropped. Notes for the user are added to `journal`, the record of the run.
+    /// the final optimization steps. The larger model is the smallest sufficient one that earlier calls have stored or,
+    /// if there is none, `start`: the Gaussians that ranking keeps. If `start` has more Gaussians than the model with
+    /// which earlier calls began, their models are dropped first. Notes for the user are added to `journal`, the record
+    /// of the run.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.

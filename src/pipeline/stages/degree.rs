@@ -84,7 +84,7 @@ impl Degree {
         let gaussian_count = scored.gaussian_count();
         let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
         journal.run_cached_stage(NAME, gaussian_count, scene, key, |journal| {
-            let counts = CountPlan { max_start: self.refine.prunes.then_some(self.refine.max_start), searches: false };
+            let counts = CountPlan::new(Some(&self.refine), false);
             let initial_count =
                 |gaussians: usize| counts.count_before_refinement(gaussians, gaussian_count).min(ranked.order().len());
             let largest = fits.iter().map(|fit| initial_count(fit.gaussians)).max().unwrap_or_default();

@@ -26,7 +26,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let scan = &planning.request.recipe.scan;
     if scan.coverage == Coverage::Auto && !planning.input.has_cameras {
         let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
-        let visible = VisibilityStage { recipe: scan.clone(), is_preliminary: false, decides_nothing: false };
+        let visible = VisibilityStage { recipe: scan.clone(), is_preliminary: false, needs_few_views: false };
         stages.leave_out_stage("visible coverage", why, move |work, limits| visible.resource_estimate(work, limits));
     }
     stages.add(Phase::Rank, MeasureStages::from_planning(planning));
@@ -57,8 +57,8 @@ impl MeasureStages {
             && Rounds::from_recipe(&recipe.select, planning.target_fraction()).is_some();
         if let Some(visible) = &mut measure.visible {
             visible.is_preliminary = measure.scan.can_be_partial;
-            // Unless Gaussians are merged in the order of their scores.
-            visible.decides_nothing = visible.is_preliminary && !planning.merges;
+            // If nothing merges, no decision depends on the scores.
+            visible.needs_few_views = visible.is_preliminary && !planning.merges;
         }
         measure
     }
@@ -106,7 +106,7 @@ impl MeasureStages {
     pub fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         scene.set_excluded_ids(&[]);
         let ScoreStage { snap_noise, non_finite, score, select, user, .. } = &self.score;
-        let visible = self.visible.as_ref().map(|visible| (visible.is_preliminary, visible.decides_nothing));
+        let visible = self.visible.as_ref().map(|visible| (visible.is_preliminary, visible.needs_few_views));
         let key = scene.work.key(&(
             (&self.scan.recipe, self.scan.can_be_partial, visible, snap_noise, non_finite, score, user),
             (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),

@@ -57,8 +57,8 @@ pub(crate) struct Rounds {
     pub usual: f64,
 }
 
-/// Value of [`Rounds::pixels_per_gaussian`] if the ranking alone decides which Gaussians stay. Three
-/// trained scenes have the same quality with 0.5 as with 1, at 60 and 30% kept; with 0.35 they have 0.1 to 0.3 dB less.
+/// Value of [`Rounds::pixels_per_gaussian`] if the ranking alone decides which Gaussians stay. Three trained scenes have
+/// the same quality with 0.5 as with 1, at 60 and 30% kept; with 0.35 they have 0.1 to 0.3 dB less.
 const PIXELS_PER_GAUSSIAN: f64 = 0.5;
 /// Value of [`Rounds::pixels_per_gaussian`] if refinement follows, which makes up for the difference.
 const PIXELS_BEFORE_REFINEMENT: f64 = 0.35;
