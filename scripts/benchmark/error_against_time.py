@@ -25,7 +25,7 @@ def settings():
     """Returns curve, setting and options of every run."""
     found = [("effort", name, ["--effort", name]) for name in ("fast", "default", "best")]
     for steps in (150, 400, 800, 3000):
-        before_a_prune_step = round(steps * 260 / 1300)
+        before_a_prune_step = round(steps * 260 / 1500)
         options = ["--set", f"refine_steps={steps}", "--set", f"refine_steps_per_prune={before_a_prune_step}"]
         found.append(("steps", str(steps), options))
     found.append(("point", "no-refine", ["--no-refine"]))

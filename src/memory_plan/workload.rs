@@ -1,7 +1,5 @@
 //! Sizes of an input from which memory and time of a run are estimated, and the measured time of common operations.
 
-use std::num::NonZeroU32;
-
 use crate::files::frame_stream::StreamHeader;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, Rig, SequenceInfo, ViewSchedule};
@@ -9,7 +7,7 @@ use crate::models::MemoryProfile;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::{GAUSSIANS_PER_BLOCK, VIEWS_PER_THREAD};
-use crate::render;
+use crate::render::{self, GridStrides};
 
 /// Bytes of memory per tile (stored block of values) of an open container: a flag that tells whether the tile's
 /// checksum has been verified.
@@ -254,10 +252,11 @@ impl Workload {
         views * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
-    /// Returns a copy of this workload for renders of only every `stride`-th pixel in each direction, with the number
-    /// of pixels of such renders.
-    pub fn on_grid(&self, stride: NonZeroU32) -> Workload {
-        Workload { pixels: self.pixels / u64::from(stride.get()).pow(2), ..*self }
+    /// Returns a copy of this workload for renders of a grid of pixels with the strides `strides`, with the number of
+    /// pixels of such renders.
+    pub fn on_grid(&self, strides: GridStrides) -> Workload {
+        let [x, y] = strides.map(|stride| u64::from(stride.get()));
+        Workload { pixels: self.pixels / (x * y), ..*self }
     }
 
     /// Returns the time in seconds on one processor core for reading the states of `gaussians` Gaussians at `frames`

@@ -17,7 +17,7 @@ pub use gather::{BlockwiseReader, gather, gather_all};
 pub use held::FramesInMemory;
 pub use parts::BlockSlices;
 pub use sample::{
-    VIEWS_PER_FRAME, ViewSampler, frames_needed_to_see_all, pixel_stride, scoring_views, select_evenly,
+    VIEWS_PER_FRAME, ViewSampler, frames_needed_to_see_all, grid_strides, pixel_stride, scoring_views, select_evenly,
     select_evenly_over_frames,
 };
 pub use some_frames::SomeFrames;

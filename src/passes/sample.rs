@@ -4,6 +4,7 @@ use std::num::NonZeroU32;
 
 use crate::model::{FrameView, ViewSchedule};
 use crate::recipe;
+use crate::render::GridStrides;
 
 /// Number of views that a selection of few views takes from each frame that it uses; more only if there are too few
 /// frames. Reading a frame takes long, so it is better to render several of its views and to read fewer frames.
@@ -11,13 +12,22 @@ pub const VIEWS_PER_FRAME: usize = 3;
 
 /// Maximum stride at which the pixels of a view are rendered (every stride-th pixel in each direction). Beyond this
 /// stride, the work per Gaussian dominates the time of a render.
-const MAX_PIXEL_STRIDE: u32 = 4;
+const MAX_PIXEL_STRIDE: NonZeroU32 = NonZeroU32::new(4).unwrap();
+
+/// Returns the strides of a grid that holds at least `target_pixels` of the `pixels` pixels of a view, but at least 1/16
+/// of them. The stride along rows is that along columns or one more.
+pub fn grid_strides(pixels: u64, target_pixels: f64) -> GridStrides {
+    let along_columns = pixel_stride(pixels, target_pixels);
+    let ratio = pixels as f64 / target_pixels.max(1.0);
+    let along_rows = NonZeroU32::new((ratio / f64::from(along_columns.get())) as u32).unwrap_or(NonZeroU32::MIN);
+    [along_rows.min(along_columns.saturating_add(1)).min(MAX_PIXEL_STRIDE), along_columns]
+}
 
 /// Returns the stride n, from 1 to 4, such that every n-th pixel of a view in each direction gives about
 /// `target_pixels` pixels. `pixels`: number of all pixels of the view. The stride is rounded down.
 pub fn pixel_stride(pixels: u64, target_pixels: f64) -> NonZeroU32 {
     let stride = (pixels as f64 / target_pixels.max(1.0)).sqrt();
-    NonZeroU32::new((stride as u32).min(MAX_PIXEL_STRIDE)).unwrap_or(NonZeroU32::MIN)
+    NonZeroU32::new(stride as u32).map_or(NonZeroU32::MIN, |stride| stride.min(MAX_PIXEL_STRIDE))
 }
 
 /// Sampler of every n-th frame and of every m-th view in such a frame, for frames that arrive one by one.

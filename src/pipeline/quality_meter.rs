@@ -88,7 +88,7 @@ impl<'a> QualityMeter<'a> {
                             let image = render(view.states[0], view.camera, background);
                             Ok(decibels(mean_square(
                                 &image,
-                                &targets.values(numbers[places[first + place]], targets.stride())?,
+                                &targets.values(numbers[places[first + place]], targets.strides())?,
                             )))
                         }
                     }

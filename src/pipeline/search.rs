@@ -7,8 +7,6 @@
 //! kept, so that the refinement of a smaller model continues from one of them. A quarter of the views is never used by
 //! the search and gives the reported quality (method.md, section 6.3).
 
-use std::num::NonZeroU32;
-
 use super::planning::Planning;
 use super::quality_meter::{QualityMeter, QualityReference};
 use super::request::{Goal, Quality};
@@ -32,7 +30,7 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::prune_steps::PrunedModels;
 use crate::refinement::targets::{TargetViewParams, Targets, ViewSplit, ViewStrides};
 use crate::refinement::{RefineRun, RefineStage};
-use crate::render;
+use crate::render::{self, ALL_PIXELS};
 use crate::scene::Scene;
 use crate::scene::add_file_stamps;
 use crate::scene::photographs::Photographs;
@@ -183,9 +181,10 @@ impl SearchStage {
         let found = run.journal.run_cached_stage(NAME, ranking.order().len(), scene, key, |journal| {
             let photographs = self.photographs(scene)?;
             let (pixels, count) = (scene.workload().pixels, scored.gaussian_count());
-            let stride = self.refine.as_ref().map_or(NonZeroU32::MIN, |refine| refine.stride(pixels, count));
-            let strides = ViewStrides::with_whole_validation(stride);
-            let targets = Targets::new(scene, self.target_views, strides, photographs.is_none())?;
+            let training = self.refine.as_ref().map_or(ALL_PIXELS, |refine| refine.strides(pixels, count));
+            let strides = ViewStrides::with_whole_validation(training);
+            let target_views = self.target_views.with_frames(scored.frames_needed_to_see_all);
+            let targets = Targets::new(scene, target_views, strides, photographs.is_none())?;
             let parts = targets.split();
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());

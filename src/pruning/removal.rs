@@ -1,13 +1,11 @@
 //! Removal error of each Gaussian of a subset of the input: the squared error that removing this Gaussian alone would
 //! cause in the views by which Gaussians are scored.
 
-use std::num::NonZeroU32;
-
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, FrameView};
 use crate::passes::views::{RenderedSource, Workers};
-use crate::render::{PixelGrid, RemovalError, Renderer};
+use crate::render::{GridStrides, PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
 /// Renders only the Gaussians `ids` and returns for each of them the [`RemovalError`], the squared error that removing
@@ -28,7 +26,7 @@ pub fn removal_error(
     ids: &[u32],
     (cameras, views): (&[Camera], &[FrameView]),
     background: [f32; 3],
-    (contrast_floor, stride): (f32, NonZeroU32),
+    (contrast_floor, strides): (f32, GridStrides),
     limits: Limits,
     advance: impl Fn() + Sync,
 ) -> Result<RemovalError> {
@@ -39,7 +37,7 @@ pub fn removal_error(
         views,
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
         |(renderer, errors), state, camera| {
-            renderer.removal_error(state, PixelGrid::centered(stride).sampled_view(camera), background, errors);
+            renderer.removal_error(state, PixelGrid::centered(strides).sampled_view(camera), background, errors);
             advance();
         },
     )?;
@@ -54,6 +52,7 @@ mod tests {
     use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::Split;
     use crate::passes::{VIEWS_PER_FRAME, gather, select_evenly};
+    use crate::render::ALL_PIXELS;
 
     #[test]
     fn errors_equal_a_plain_loop_on_any_thread_count() {
@@ -81,7 +80,7 @@ mod tests {
                         &ids,
                         (&schedule.cameras, &sample),
                         background,
-                        (0.1, NonZeroU32::MIN),
+                        (0.1, ALL_PIXELS),
                         limits,
                         || (),
                     )

@@ -72,7 +72,11 @@ impl VisibilityStage {
         }
         let stride = self.pixel_stride(work.pixels, work.gaussians as usize);
         let seconds = work.reading_seconds(work.gaussian_count(), frames as f64)
-            + work.on_grid(stride).render_seconds(strided.min(max_views), work.gaussian_count(), CONTRIBUTION_COST);
+            + work.on_grid([stride; 2]).render_seconds(
+                strided.min(max_views),
+                work.gaussian_count(),
+                CONTRIBUTION_COST,
+            );
         ResourceEstimate { stage: NAME, reads: work.whole_input_reads(frames, limits), seconds, per_gaussian, fixed }
     }
 

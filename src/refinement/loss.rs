@@ -1,13 +1,11 @@
 //! Loss that refinement minimizes: the difference between renders and target views (renders of the original model).
 
-use std::num::NonZeroU32;
-
 use serde::{Deserialize, Serialize};
 
 use super::targets::{mean_square, wide};
 use crate::metrics::{METRIC_BYTES_PER_PIXEL, SSIM_GRADIENT_BYTES_PER_PIXEL, decibels, ssim, ssim_gradient};
-use crate::passes::pixel_stride;
-use crate::render::Image;
+use crate::passes::grid_strides;
+use crate::render::{ALL_PIXELS, GridStrides, Image};
 
 /// Weight of the newest step in the running mean square of derivatives (see [`limit_gradient`]). The earlier mean has
 /// the rest of 1.
@@ -17,8 +15,8 @@ const NEWEST_WEIGHT: f64 = 0.1;
 /// is 0.006.
 const SQUARED_WEIGHT: f64 = 20.0;
 /// Wanted number of rendered pixels of a training view per survivor (Gaussian left by pruning). It determines the
-/// stride of the rendered pixels. In measurements with at least 2 pixels per survivor, refinement lost at most 0.1 dB.
-const PIXELS_PER_SURVIVOR: f64 = 2.5;
+/// strides of the rendered pixels. In measurements, 2.5 gained 0 to 0.3 dB in 2 to 10% more time.
+const PIXELS_PER_SURVIVOR: f64 = 1.8;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -58,13 +56,13 @@ impl Loss {
         gradient
     }
 
-    /// Returns the stride n of the training views: only every n-th column and row of pixels is rendered and compared.
-    /// `pixels`: number of pixels of a view. `survivors`: number of Gaussians left by pruning. The stride is 1 if SSIM
-    /// is part of the loss, because SSIM needs neighboring pixels.
-    pub(super) fn stride(&self, pixels: u64, survivors: usize) -> NonZeroU32 {
+    /// Returns the strides of the grid of pixels of training views that are rendered and compared. `pixels`: number of
+    /// pixels of a view. `survivors`: number of Gaussians left by pruning. All pixels are rendered if SSIM is part of
+    /// the loss, because SSIM needs neighboring pixels.
+    pub(super) fn strides(&self, pixels: u64, survivors: usize) -> GridStrides {
         match self.ssim > 0.0 {
-            true => NonZeroU32::MIN,
-            false => pixel_stride(pixels, PIXELS_PER_SURVIVOR * survivors as f64),
+            true => ALL_PIXELS,
+            false => grid_strides(pixels, PIXELS_PER_SURVIVOR * survivors as f64),
         }
     }
 

@@ -31,8 +31,6 @@ pub(crate) mod targets;
 
 pub(crate) use run::RefineRun;
 
-use std::num::NonZeroU32;
-
 use crate::cache::CacheKey;
 use crate::limits::Limits;
 use crate::memory_plan::{
@@ -40,11 +38,11 @@ use crate::memory_plan::{
     bytes_of_survivors,
 };
 use crate::model::{Attributes, NO_SH_LIMIT};
-use crate::passes::pixel_stride;
+use crate::passes::grid_strides;
 use crate::pruning::score::scored_memory;
 use crate::recipe;
 use crate::refinement::optimizer_state::{REEVALUATE_EVERY, StepParams, keyframe_count};
-use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES, STRIP_BYTES};
+use crate::render::{ALL_PIXELS, GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES, GridStrides, STRIP_BYTES};
 use loss::Loss;
 use targets::{TargetViewParams, ViewStrides};
 
@@ -71,8 +69,8 @@ const FULL_STEPS_FRACTION: f64 = 0.4;
 const CHEAP_STEPS_FRACTION: f64 = 0.1;
 /// If the fraction k of all Gaussians stays, the number of final steps has the factor ([`CHEAP_STEPS_FRACTION`] / k) to
 /// this power, at most 1.
-const STEP_COST_POWER: f64 = 0.25;
-/// A validation view is rendered at the largest stride, from 1 to 4, that leaves at least this many of its pixels.
+const STEP_COST_POWER: f64 = 0.6;
+/// A validation view is rendered at the largest strides, from 1 to 4, that leave at least this many of its pixels.
 const VALIDATION_PIXELS: f64 = 20_000.0;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_KEPT_FRACTION: f64 = 0.8;
@@ -212,34 +210,34 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Returns the strides at which the target views are stored. That of the training views is [`RefineStage::stride`]
-    /// for `first` Gaussians, the number with which refinement begins. If prune steps remove Gaussians, it is the
-    /// stride for a third of `first`, because fewer Gaussians allow a larger stride. `pixels`: number of pixels of a
+    /// Returns the strides at which the target views are stored. Those of the training views are [`RefineStage::strides`]
+    /// for `first` Gaussians, the number with which refinement begins. If prune steps remove Gaussians, they are the
+    /// strides for a third of `first`, because fewer Gaussians allow larger strides. `pixels`: number of pixels of a
     /// view.
     pub(crate) fn stored_strides(&self, pixels: u64, first: usize) -> ViewStrides {
         let fewer = if self.prunes { first / 3 } else { first };
-        ViewStrides { training: self.stride(pixels, fewer), validation: self.validation_stride(pixels) }
+        ViewStrides { training: self.strides(pixels, fewer), validation: self.validation_strides(pixels) }
     }
 
-    /// Returns the stride at which the training views are stored for the input `work`, if refinement begins with `first`
-    /// Gaussians. A search, which has no target, stores them at the stride for all Gaussians.
-    fn stored_training_stride(&self, work: &Workload, first: f64) -> NonZeroU32 {
+    /// Returns the strides at which the training views are stored for the input `work`, if refinement begins with `first`
+    /// Gaussians. A search, which has no target, stores them at the strides for all Gaussians.
+    fn stored_training_strides(&self, work: &Workload, first: f64) -> GridStrides {
         match self.target {
             Some(_) => self.stored_strides(work.pixels, first as usize).training,
-            None => self.stride(work.pixels, work.gaussian_count() as usize),
+            None => self.strides(work.pixels, work.gaussian_count() as usize),
         }
     }
 
-    /// Returns the stride of validation views with `pixels` pixels. It leaves at least [`VALIDATION_PIXELS`], and is 1 if
-    /// SSIM is part of the loss.
-    fn validation_stride(&self, pixels: u64) -> NonZeroU32 {
-        if self.loss.ssim > 0.0 { NonZeroU32::MIN } else { pixel_stride(pixels, VALIDATION_PIXELS) }
+    /// Returns the strides of validation views with `pixels` pixels. They leave at least [`VALIDATION_PIXELS`], and all
+    /// pixels if SSIM is part of the loss.
+    fn validation_strides(&self, pixels: u64) -> GridStrides {
+        if self.loss.ssim > 0.0 { ALL_PIXELS } else { grid_strides(pixels, VALIDATION_PIXELS) }
     }
 
-    /// Returns the stride n of the training views: only every n-th column and row of pixels is rendered and compared.
-    /// `pixels`: number of pixels of a view. `survivors`: number of Gaussians left by pruning. See [`Loss::stride`].
-    pub(crate) fn stride(&self, pixels: u64, survivors: usize) -> NonZeroU32 {
-        self.loss.stride(pixels, survivors)
+    /// Returns the strides of the grid of pixels of training views that are rendered and compared.
+    /// `pixels`: number of pixels of a view. `survivors`: number of Gaussians left by pruning. See [`Loss::strides`].
+    pub(crate) fn strides(&self, pixels: u64, survivors: usize) -> GridStrides {
+        self.loss.strides(pixels, survivors)
     }
 
     /// Returns the number of final steps (optimization steps after the last prune step) for a model that keeps `count`
@@ -342,14 +340,14 @@ impl RefineStage {
             };
             // With a deformation field, states and their Jacobians take twice as long to evaluate as states alone.
             let found = if work.input.jacobian > 0 { 2.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
-            let strided = work.on_grid(self.stride(work.pixels, count as usize));
+            let strided = work.on_grid(self.strides(work.pixels, count as usize));
             work.reading_seconds(count, frames as f64 * found)
                 + work.render_seconds(renders, count, RENDER_COST)
                 + strided.render_seconds(STEP_RENDERS * steps as f64, count, RENDER_COST)
                 + strided.render_seconds(ranked, count, REMOVAL_COST)
         };
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
-        let stored = work.on_grid(self.stored_training_stride(work, first));
+        let stored = work.on_grid(self.stored_training_strides(work, first));
         // Validation and test views may be whole. `together` of them are rendered at a time, with 6 bytes per pixel of
         // the target view. Steps render pixels of a grid, and hold the image, its gradient and the target views of two
         // steps.

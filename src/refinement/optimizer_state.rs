@@ -18,7 +18,7 @@ use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::FrameStates;
 use crate::refinement::optimizer::{Adam, RateSchedule};
-use crate::render::{RemovalError, Renderer};
+use crate::render::{GridStrides, RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, ReadPlan};
 
@@ -45,15 +45,17 @@ pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
     if keyframe_count > 1 { keyframe_count } else { 0 }
 }
 
-/// Number of optimization steps between two evaluations of the frame states from the stored parameters. Needed only if
-/// the model has a deformation field; otherwise a frame state is always the state at the start plus the delta.
-pub(super) const REEVALUATE_EVERY: usize = 200;
+/// Approximate number of optimization steps between two evaluations of the frame states from the stored parameters.
+/// Needed only if the model has a deformation field; otherwise a frame state is always the state at the start plus the
+/// delta. 200 gain up to 0.1 dB in 3% more time. The derivatives have to be evaluated as often: with those of the start,
+/// results lose 1 to 2 dB.
+pub(super) const REEVALUATE_EVERY: usize = 250;
 
 /// Optimizer together with its data: the frame states (attributes at one frame) of the Gaussians left by pruning, at
 /// the frames of the target views, and the delta (change of the parameters since the start of refinement).
 ///
 /// If the model has a deformation field, a frame state is not simply the stored parameters plus a delta. Each state is
-/// then evaluated anew every [`REEVALUATE_EVERY`] steps, and extrapolated with its derivatives (Jacobian) in between.
+/// then evaluated anew about every [`REEVALUATE_EVERY`] steps, and extrapolated with its derivatives (Jacobian) in between.
 /// Evaluating the field and its derivatives at every step would take three times as long and gain nothing (method.md,
 /// section 6.2).
 ///
@@ -90,14 +92,16 @@ pub(super) struct OptimizerState<'a> {
     /// Data of the next optimization step if it was read during the last one.
     prefetched: Option<StepInput>,
     renderer: Renderer,
-    /// Stride n of the training views: only every n-th column and row of pixels is rendered in optimization steps and
-    /// for the ranking of a prune step.
-    stride: NonZeroU32,
+    /// Strides of the grid of pixels of training views that are rendered in optimization steps and for the ranking of a
+    /// prune step.
+    strides: GridStrides,
     /// Running mean square of the derivatives of the loss with respect to color values ([`Loss::gradient`]), over the
     /// optimization steps on views that are not guard views ([`Targets::is_guard`]). `None` before the first such step.
     mean_square_gradient: Option<f64>,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
+    /// Number of optimization steps between two evaluations of the frame states.
+    reevaluate_every: usize,
     /// Whether the frame states were evaluated again after `constant_optimizer` (optimizer of the stored parameters)
     /// was created. It is created at the beginning and again in every prune step.
     reevaluated: bool,
@@ -157,9 +161,10 @@ impl<'a> OptimizerState<'a> {
             now: LinearizedState::none(state_degree),
             prefetched: None,
             renderer: Renderer::on_all_threads(),
-            stride: targets.stride(),
+            strides: targets.strides(),
             mean_square_gradient: None,
             steps: 0,
+            reevaluate_every: REEVALUATE_EVERY,
             reevaluated: false,
             frames,
             varying,
@@ -194,19 +199,21 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Replaces the optimizer of the stored parameters, `constant_optimizer`, by a new one for the Gaussians that are
-    /// left. Its delta is 0. Also sets `stride`, the stride of the rendered pixels of training views, for this number
-    /// of Gaussians (see [`Loss::stride`]).
+    /// left. Its delta is 0. Also sets `strides`, the strides of the rendered pixels of training views, for this number
+    /// of Gaussians (see [`Loss::strides`]).
     fn start_optimizer(&mut self) {
         (self.reevaluated, self.prefetched) = (false, None);
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
         let StepParams { columns, sh_degree, loss } = self.step_params;
         self.constant_optimizer = Adam::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
-        // A multiple of the stride at which the target views are stored.
-        let (pixels, stored) = (self.scene.workload().pixels, self.targets.stride());
-        let wanted = loss.stride(pixels, state.len());
-        let multiple = NonZeroU32::new(wanted.get() / stored).unwrap_or(NonZeroU32::MIN);
-        self.stride = stored.saturating_mul(multiple);
+        // Multiples of the strides at which the target views are stored.
+        let (pixels, stored) = (self.scene.workload().pixels, self.targets.strides());
+        let wanted = loss.strides(pixels, state.len());
+        self.strides = [0, 1].map(|axis| {
+            let multiple = NonZeroU32::new(wanted[axis].get() / stored[axis]).unwrap_or(NonZeroU32::MIN);
+            stored[axis].saturating_mul(multiple)
+        });
     }
 
     /// Adds a time-varying delta with `keyframe_count` keyframes, which starts at 0. The delta changes only attributes
@@ -260,6 +267,14 @@ impl<'a> OptimizerState<'a> {
         } else {
             baked_delta
         }
+    }
+
+    /// Divides the optimization steps between two validations into equal parts of about [`REEVALUATE_EVERY`] steps. The
+    /// frame states are evaluated anew after each part, so that none is evaluated shortly before a validation, which
+    /// evaluates them too. `validate_every`: number of steps between two validations.
+    pub(super) fn reevaluate_between_validations(&mut self, validate_every: usize) {
+        let parts = (validate_every as f64 / REEVALUATE_EVERY as f64).round().max(1.0);
+        self.reevaluate_every = (validate_every as f64 / parts).ceil() as usize;
     }
 
     /// Evaluates the frame states anew from the stored parameters. Does nothing if the model has no deformation field,
@@ -426,8 +441,8 @@ impl<'a> OptimizerState<'a> {
 
     /// Returns the scratch files of the optimization steps.
     fn step_files(&self) -> StepFiles<'_> {
-        let OptimizerState { targets, stride, ref frames, ref linearized, .. } = *self;
-        StepFiles { targets, stride, frames, linearized }
+        let OptimizerState { targets, strides, ref frames, ref linearized, .. } = *self;
+        StepFiles { targets, strides, frames, linearized }
     }
 
     /// Makes one optimization step of the constant delta, on target view `k` with the learning rates of `schedule`.
@@ -437,12 +452,12 @@ impl<'a> OptimizerState<'a> {
     /// # Errors
     /// Fails if a scratch file cannot be read or written.
     pub(super) fn step(&mut self, k: usize, next: Option<usize>, schedule: &RateSchedule) -> Result<()> {
-        if self.steps == REEVALUATE_EVERY {
+        if self.steps == self.reevaluate_every {
             self.reevaluate_states()?;
         }
         self.steps += 1;
         // An evaluation of the states at the start of the next step would replace the data read for it.
-        let is_reevaluated = self.deformation.is_some() && self.steps == REEVALUATE_EVERY;
+        let is_reevaluated = self.deformation.is_some() && self.steps == self.reevaluate_every;
         self.differentiate(k, next.filter(|_| !is_reevaluated))?;
         self.constant_optimizer.step(&self.gradients, 1.0, schedule);
         Ok(())
@@ -483,7 +498,7 @@ impl<'a> OptimizerState<'a> {
         self.gradients.clear();
         let StepParams { columns, sh_degree, loss } = self.step_params;
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
-        let OptimizerState { scene, targets, stride, ref frames, ref linearized, .. } = *self;
+        let OptimizerState { scene, targets, strides, ref frames, ref linearized, .. } = *self;
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
         let (is_guard, mean_square) = (targets.is_guard(k), &mut self.mean_square_gradient);
         // Also updates the running mean.
@@ -492,9 +507,9 @@ impl<'a> OptimizerState<'a> {
             limit_gradient(&mut gradient, is_guard, mean_square);
             (0.0, gradient)
         };
-        let (renderer, view) = (&mut self.renderer, targets.view(k, stride));
+        let (renderer, view) = (&mut self.renderer, targets.view(k, strides));
         let next = next.filter(|_| rayon::current_num_threads() > 1);
-        let files = StepFiles { targets, stride, frames, linearized };
+        let files = StepFiles { targets, strides, frames, linearized };
         let ((), read) = rayon::join(
             || _ = renderer.gradient(&now.state, view, scene.background, pull, gradients),
             || next.map(|next| StepInput::read(files, next, spare)).transpose(),
@@ -515,7 +530,7 @@ impl<'a> OptimizerState<'a> {
         let delta = self.rendered_delta();
         let errors = |(renderer, now): &mut (Renderer, LinearizedState), &k: &usize| {
             self.compute_state(self.frame_index(k), &delta, now)?;
-            let (view, values) = (self.targets.view(k, self.stride), self.targets.values(k, self.stride)?);
+            let (view, values) = (self.targets.view(k, self.strides), self.targets.values(k, self.strides)?);
             let image = renderer.render(&now.state, view, self.scene.background);
             Ok(self.step_params.loss.errors(&image, &values))
         };
@@ -539,7 +554,7 @@ impl<'a> OptimizerState<'a> {
             self.compute_state(self.frame_index(k), self.constant_optimizer.delta(), &mut now)?;
             let mut sparse = now.present.as_ref().map(|present| RemovalError::new(present.len(), contrast_floor));
             let found = sparse.as_mut().unwrap_or(&mut errors);
-            let view = self.targets.view(k, self.stride);
+            let view = self.targets.view(k, self.strides);
             renderer.removal_error(&now.state, view, self.scene.background, found);
             if let Some((present, found)) = now.present.as_ref().zip(sparse) {
                 errors.merge_rows(present, &found);

@@ -83,7 +83,7 @@ mod tests {
         let fixed: Vec<bool> = kept.iter().map(|id| id % 7 == 0).collect();
         let compressed = crate::compressed_model::CompressedModel::pruned(kept, &recipe.merge);
         let result = scene.input.compressed_frames(&compressed).unwrap();
-        let whole = ViewStrides::with_whole_validation(std::num::NonZeroU32::MIN);
+        let whole = ViewStrides::with_whole_validation(crate::render::ALL_PIXELS);
         let targets = Targets::new(&scene, stage.target_views, whole, false).unwrap();
         let start = crate::passes::gather_all(&*result, 0, Attributes::all()).unwrap();
         // Log scales, opacities and colors in steps of 1/2, positions and rotations in steps of 2^-10.

@@ -39,7 +39,7 @@ const RATE_REDUCTION: f32 = 0.3;
 /// Learning rate at the last of the optimization steps before a prune step, divided by the rate at the first of them.
 const LAST_RATE_BEFORE_PRUNING: f32 = 1.0;
 /// Learning rate at the last of the final steps, divided by the rate at the first of them.
-const LAST_RATE_OF_FINAL_STEPS: f32 = 0.5;
+const LAST_RATE_OF_FINAL_STEPS: f32 = 0.2;
 
 impl RefineStage {
     /// Prunes the model `compressed` in prune steps to `target_count` Gaussians and refines it. Returns the model with
@@ -67,11 +67,12 @@ impl RefineStage {
             journal.leave_out("refinement", "no Gaussians were removed");
             return Ok(compressed);
         }
-        let key = scene.work.key(&(self.key(), &compressed, target_count, steps, &scored.protected));
+        let target_views = self.target_views.with_frames(scored.frames_needed_to_see_all);
+        let key = scene.work.key(&(self.key(), target_views, &compressed, target_count, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, count, scene.source(), |journal| {
                 let strides = self.stored_strides(scene.workload().pixels, count);
-                let targets = Targets::new(scene, self.target_views, strides, false)?;
+                let targets = Targets::new(scene, target_views, strides, false)?;
                 scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets);
                 Ok((run.run_all(&compressed, target_count, steps, journal)?.0, target_count))
@@ -467,6 +468,7 @@ impl<'a> RefineRun<'a> {
             }
         };
         let validate_every = steps.div_ceil(3).clamp(VALIDATE_EVERY[0], VALIDATE_EVERY[1]);
+        optimizer.reevaluate_between_validations(validate_every);
         for step in done + 1..=steps {
             let is_validated = self.refine.validates && step % validate_every == 0 || step == steps;
             self.step(!is_validated, |view, next| optimizer.step(view, next, &schedule))?;

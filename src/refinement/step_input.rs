@@ -1,7 +1,7 @@
 //! Data that an optimization step reads from scratch files. They do not depend on the parameters that earlier steps
 //! change, so they can be read before these steps end.
 
-use std::num::NonZeroU32;
+use crate::render::GridStrides;
 
 use super::linearized::{LinearizedFrames, LinearizedState};
 use super::targets::Targets;
@@ -22,8 +22,8 @@ pub(super) struct StepInput {
 #[derive(Clone, Copy)]
 pub(super) struct StepFiles<'a> {
     pub(super) targets: &'a Targets,
-    /// Stride n of the training views: only every n-th column and row of pixels is read.
-    pub(super) stride: NonZeroU32,
+    /// Strides of the grid of pixels of training views that are read.
+    pub(super) strides: GridStrides,
     /// Indices of the frames of the target views, increasing.
     pub(super) frames: &'a [usize],
     /// State of each frame in `frames`.
@@ -37,7 +37,7 @@ impl StepInput {
     /// # Errors
     /// Fails if a scratch file cannot be read.
     pub(super) fn read(files: StepFiles<'_>, view: usize, mut frame: LinearizedState) -> Result<StepInput> {
-        let target = files.targets.values(view, files.stride)?;
+        let target = files.targets.values(view, files.strides)?;
         files.linearized.read(files.frame_index(view), &mut frame)?;
         Ok(StepInput { view, target, frame })
     }

@@ -1,6 +1,5 @@
 //! Target views: renders of the original model, or photographs, that refinement fits Gaussians to.
 
-use std::num::NonZeroU32;
 use std::ops::Range;
 
 use hashbrown::HashSet;
@@ -10,9 +9,9 @@ use serde::Serialize;
 use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, FrameView, hash_id};
-use crate::passes::{BatchLimits, RenderableView, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly};
+use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch, select_evenly_over_frames};
 use crate::recipe::RefineParams;
-use crate::render::{Image, PixelGrid, Renderer, SampledView};
+use crate::render::{ALL_PIXELS, GridStrides, Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::views_between::{SplitMix64, cameras_between};
@@ -26,7 +25,7 @@ const PHOTOGRAPHS_NAME: &str = "photograph-targets";
 /// cameras, which are between two of the scene's cameras or outside the rig.
 const SCENE_VIEW_PART: [usize; 2] = [3, 26];
 /// Maximum number of target views from the scene's cameras.
-const MAX_SCENE_VIEWS: usize = 60;
+const MAX_SCENE_VIEWS: usize = 45;
 /// Numerator and denominator of the fraction of target views that are photographs, in a refinement toward photographs.
 const PHOTOGRAPH_PART: [usize; 2] = [20, 26];
 /// Maximum number of target views that are photographs.
@@ -71,11 +70,19 @@ pub struct TargetViewParams {
     pub max_count: usize,
     /// Whether some target views are from new cameras: between the scene's cameras, or outside the rig.
     pub between: bool,
+    /// Number of frames from which target views are needed so that nearly all Gaussians are alive in one of them. Views
+    /// are taken from at least so many frames if there are enough views from the scene's cameras.
+    pub frames: usize,
 }
 
 impl TargetViewParams {
     pub(crate) fn from_recipe(params: &RefineParams) -> TargetViewParams {
-        TargetViewParams { max_count: params.refine_target_views, between: params.refine_between }
+        TargetViewParams { max_count: params.refine_target_views, between: params.refine_between, frames: 0 }
+    }
+
+    /// Returns a copy with `frames` as [`TargetViewParams::frames`].
+    pub(crate) fn with_frames(self, frames: usize) -> TargetViewParams {
+        TargetViewParams { frames, ..self }
     }
 
     /// Returns two numbers of target views: the number from the scene's cameras, and the number from new cameras. Their
@@ -130,18 +137,18 @@ pub(crate) struct Targets {
     values: Vec<(Range<usize>, Spill)>,
 }
 
-/// Strides n of the target views: only every n-th column and row of pixels is stored. Test views are stored as a whole,
-/// and so are the validation views of a search and of a fit to photographs.
+/// Strides of the grids of pixels that are stored of target views. Test views are stored as a whole, and so are the
+/// validation views of a search and of a fit to photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub(crate) struct ViewStrides {
-    pub(crate) training: NonZeroU32,
-    pub(crate) validation: NonZeroU32,
+    pub(crate) training: GridStrides,
+    pub(crate) validation: GridStrides,
 }
 
 impl ViewStrides {
     /// Returns strides with which validation views are stored as a whole.
-    pub(crate) fn with_whole_validation(training: NonZeroU32) -> ViewStrides {
-        ViewStrides { training, validation: NonZeroU32::MIN }
+    pub(crate) fn with_whole_validation(training: GridStrides) -> ViewStrides {
+        ViewStrides { training, validation: ALL_PIXELS }
     }
 }
 
@@ -181,7 +188,7 @@ impl Targets {
         has_test_views: bool,
     ) -> Result<Targets> {
         let [scene_views, new_views] = params.view_counts(scene.workload().pixels);
-        let seen = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
+        let seen = select_evenly_over_frames(&scene.schedule, scene_views, params.frames);
         let (cameras, views, guard_cameras) = add_new_views(scene, seen, new_views);
         let purpose = |k: usize| match guard_cameras.contains(&views[k].camera) {
             true => Purpose::Training,
@@ -199,18 +206,18 @@ impl Targets {
     ///   overfitting the photographs. Their number is in a fixed ratio to the number of photographs.
     ///
     /// The photographs of one in eight cameras are validation views. If fewer than eight cameras have photographs, one
-    /// in eight photographs is a validation view. All other views are training views; of these only every `stride`-th
-    /// column and row of pixels is stored.
+    /// in eight photographs is a validation view. All other views are training views; of these only the pixels of
+    /// a grid with the strides `strides` are stored.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the scratch file cannot be written.
     pub(crate) fn with_photographs(
         scene: &Scene,
         params: TargetViewParams,
-        stride: NonZeroU32,
+        strides: GridStrides,
         (seen, photographs): (Vec<FrameView>, &Photographs),
     ) -> Result<Targets> {
-        let strides = ViewStrides::with_whole_validation(stride);
+        let strides = ViewStrides::with_whole_validation(strides);
         let new_views = params.renders_beside(seen.len());
         // Index in the schedule of each of the cameras that `add_new_views` lists first.
         let used = scene.schedule.used_cameras();
@@ -286,8 +293,8 @@ impl Targets {
         Ok(self)
     }
 
-    /// Returns the stride n of the training views: only every n-th column and row of pixels is stored.
-    pub(crate) fn stride(&self) -> NonZeroU32 {
+    /// Returns the strides of the grid of pixels that are stored of training views.
+    pub(crate) fn strides(&self) -> GridStrides {
         self.strides.training
     }
 
@@ -302,23 +309,23 @@ impl Targets {
     }
 
     /// Returns the grid of the pixels of view `k` that are rendered and compared. For a training view, these are the
-    /// pixels in every `stride`-th column and row; `stride` must be a multiple of [`Targets::stride`]. For a validation
-    /// view, the stride is that of its stored pixels. The first column and row come from a hash of `k`, so that
+    /// pixels of a grid with the strides `strides`, which must be multiples of [`Targets::strides`]. For a validation
+    /// view, the strides are those of its stored pixels. The first column and row come from a hash of `k`, so that
     /// different views sample different pixels. Of a test view, these are all pixels.
-    fn grid(&self, k: usize, stride: NonZeroU32) -> PixelGrid {
-        let stride = match self.purposes[k] {
-            Purpose::Training => stride,
+    fn grid(&self, k: usize, strides: GridStrides) -> PixelGrid {
+        let strides = match self.purposes[k] {
+            Purpose::Training => strides,
             Purpose::Validation => self.strides.validation,
-            Purpose::Test => NonZeroU32::MIN,
+            Purpose::Test => ALL_PIXELS,
         };
         let hash = hash_id(k as u64);
-        PixelGrid::new(stride, [hash as u32, (hash >> 32) as u32])
+        PixelGrid::new(strides, [hash as u32, (hash >> 32) as u32])
     }
 
     /// Returns the camera of target view `k` with the grid of the pixels to render. [`Targets::values`] returns the
-    /// target colors of the same pixels if it gets the same `stride`.
-    pub(super) fn view(&self, k: usize, stride: NonZeroU32) -> SampledView<'_> {
-        self.grid(k, stride).sampled_view(self.camera(k))
+    /// target colors of the same pixels if it gets the same `strides`.
+    pub(super) fn view(&self, k: usize, strides: GridStrides) -> SampledView<'_> {
+        self.grid(k, strides).sampled_view(self.camera(k))
     }
 
     /// Returns the camera of target view `k`.
@@ -335,35 +342,35 @@ impl Targets {
         self.guard_cameras.contains(&self.views[k].camera)
     }
 
-    /// Returns how many columns and how many rows of pixels of view `k` are rendered and compared, if only every
-    /// `stride`-th column and row is used.
-    fn size(&self, k: usize, stride: NonZeroU32) -> [usize; 2] {
+    /// Returns how many columns and how many rows of pixels of view `k` are rendered and compared, if only the pixels of
+    /// a grid with the strides `strides` are used.
+    fn size(&self, k: usize, strides: GridStrides) -> [usize; 2] {
         let camera = self.camera(k);
-        self.grid(k, stride).size([camera.width, camera.height]).map(|pixels| pixels as usize)
+        self.grid(k, strides).size([camera.width, camera.height]).map(|pixels| pixels as usize)
     }
 
     /// Reads the color values of target view `k` at the pixels that [`Targets::view`] returns: red, green, blue per
-    /// pixel, 0 to 1 as 16-bit integers. `stride` must be a multiple of [`Targets::stride`].
+    /// pixel, 0 to 1 as 16-bit integers. `strides` must be multiples of [`Targets::strides`].
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
-    pub(crate) fn values(&self, k: usize, stride: NonZeroU32) -> Result<Vec<u16>> {
-        let len = |k: usize| 3 * self.size(k, self.stride()).iter().product::<usize>();
+    pub(crate) fn values(&self, k: usize, strides: GridStrides) -> Result<Vec<u16>> {
+        let len = |k: usize| 3 * self.size(k, self.strides()).iter().product::<usize>();
         let mut values = vec![0u16; len(k)];
         for (some, spill) in self.values.iter().filter(|(some, _)| some.contains(&k)) {
             let before: usize = (some.start..k).map(len).sum();
             spill.read(2 * before as u64, bytemuck::cast_slice_mut(&mut values))?;
         }
-        let [stored, wanted] = [self.stride(), stride].map(|stride| self.grid(k, stride));
+        let [stored, wanted] = [self.strides(), strides].map(|strides| self.grid(k, strides));
         if stored == wanted {
             return Ok(values);
         }
         // Position on the stored grid of the first column and row of the wanted grid.
-        let first = [0, 1].map(|axis| ((wanted.pixel(axis, 0) - stored.pixel(axis, 0)) / stored.stride()) as usize);
-        let step = (wanted.stride() / stored.stride()) as usize;
-        let row_len = self.size(k, self.stride())[0];
-        let rows = values.as_chunks::<3>().0.chunks_exact(row_len.max(1)).skip(first[1]).step_by(step);
-        Ok(rows.flat_map(|row| row.iter().skip(first[0]).step_by(step)).flatten().copied().collect())
+        let first = [0, 1].map(|axis| ((wanted.pixel(axis, 0) - stored.pixel(axis, 0)) / stored.stride(axis)) as usize);
+        let step = [0, 1].map(|axis| (wanted.stride(axis) / stored.stride(axis)) as usize);
+        let row_len = self.size(k, self.strides())[0];
+        let rows = values.as_chunks::<3>().0.chunks_exact(row_len.max(1)).skip(first[1]).step_by(step[1]);
+        Ok(rows.flat_map(|row| row.iter().skip(first[0]).step_by(step[0])).flatten().copied().collect())
     }
 }
 
@@ -443,7 +450,7 @@ pub(super) fn wide(value: u16) -> f32 {
 impl TargetViewParams {
     /// Returns parameters for at most `max_count` target views, some of them from new cameras.
     pub(super) fn at_most(max_count: usize) -> TargetViewParams {
-        TargetViewParams { max_count, between: true }
+        TargetViewParams { max_count, between: true, frames: 0 }
     }
 }
 
@@ -466,7 +473,7 @@ mod tests {
         let value = |x: u32, y: u32, channel: u32| (100 * y + 10 * x + channel) as f32;
         let colors = (0..height).flat_map(|y| (0..width).flat_map(move |x| (0..3).map(move |c| value(x, y, c))));
         let image = Image { width, height, data: colors.collect() };
-        let grid = PixelGrid::new(NonZeroU32::new(3).unwrap(), [2, 1]);
+        let grid = PixelGrid::new([3, 2].map(|stride| std::num::NonZeroU32::new(stride).unwrap()), [2, 1]);
         let found = sampled(&image, grid);
         assert_eq!([found.width, found.height], grid.size([width, height]));
         for y in 0..found.height {
@@ -480,8 +487,8 @@ mod tests {
 
     #[test]
     fn large_views_are_fewer_but_never_too_few() {
-        assert_eq!(TargetViewParams::at_most(1000).view_counts(320 * 256), [60, 940]);
-        assert_eq!(TargetViewParams::at_most(520).view_counts(0), [60, 460]);
+        assert_eq!(TargetViewParams::at_most(1000).view_counts(320 * 256), [45, 955]);
+        assert_eq!(TargetViewParams::at_most(520).view_counts(0), [45, 475]);
         assert_eq!(TargetViewParams::at_most(1000).view_counts(1352 * 1014), [15, 115]);
         assert_eq!(TargetViewParams::at_most(1000).view_counts(1 << 40), [11, 85]);
         assert_eq!(TargetViewParams::at_most(40).view_counts(1 << 40), [4, 36]);

@@ -55,7 +55,7 @@ impl SampledPixels {
             let count = TILE.min(size[axis] - first) as usize;
             let mut offsets = TileLine::default();
             for (k, offset) in offsets.as_flattened_mut()[..count].iter_mut().enumerate() {
-                *offset = (grid.stride() * k as u32) as f32;
+                *offset = (grid.stride(axis) * k as u32) as f32;
             }
             (f64::from(grid.pixel(axis, first)), offsets, count)
         };

@@ -1,51 +1,63 @@
-//! Grid that consists of every s-th pixel of an image along x and y. A render of these pixels alone costs about 1/s² of
-//! a render of all pixels.
+//! Grid that consists of every s-th pixel of an image along x and every t-th along y. A render of these pixels alone
+//! costs about 1/(s·t) of a render of all pixels.
 
 use std::num::NonZeroU32;
 
 use super::convention::TILE;
 use splat_core::Camera;
 
-/// Grid of pixels of an image: the pixels whose column and row have given remainders when divided by the stride.
+/// Distances in pixels between neighbors of a [`PixelGrid`]: along a row (index 0) and along a column (index 1).
+pub type GridStrides = [NonZeroU32; 2];
+
+/// Strides of the grid of all pixels.
+pub const ALL_PIXELS: GridStrides = [NonZeroU32::MIN; 2];
+
+/// Grid of pixels of an image: the pixels whose column and row have given remainders when divided by the strides.
 ///
 /// A render of a grid has the same values as the render of all pixels at these pixels: footprints are those of the full
 /// image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct PixelGrid {
-    stride: u32,
-    /// Column and row of the first pixel of the grid, each below `stride`.
+    strides: GridStrides,
+    /// Column and row of the first pixel of the grid, each below the stride of its axis.
     phase: [u32; 2],
 }
 
 impl PixelGrid {
     /// Grid of all pixels.
-    pub const ALL: PixelGrid = PixelGrid { stride: 1, phase: [0; 2] };
+    pub const ALL: PixelGrid = PixelGrid { strides: ALL_PIXELS, phase: [0; 2] };
 
     /// Creates the grid of the pixels whose column and row have the remainders `phase[0]` and `phase[1]` when divided
-    /// by `stride`.
-    pub fn new(stride: NonZeroU32, phase: [u32; 2]) -> PixelGrid {
-        PixelGrid { stride: stride.get(), phase: phase.map(|phase| phase % stride) }
+    /// by `strides[0]` and `strides[1]`.
+    pub fn new(strides: GridStrides, phase: [u32; 2]) -> PixelGrid {
+        PixelGrid { strides, phase: [0, 1].map(|axis| phase[axis] % strides[axis]) }
     }
 
-    /// Creates the grid of the pixels whose column and row have the remainder `stride / 2` when divided by `stride`.
-    pub fn centered(stride: NonZeroU32) -> PixelGrid {
-        PixelGrid::new(stride, [stride.get() / 2; 2])
+    /// Creates the grid of the pixels whose column and row have the remainder s / 2 when divided by the stride s
+    /// of the axis.
+    pub fn centered(strides: GridStrides) -> PixelGrid {
+        PixelGrid::new(strides, strides.map(|stride| stride.get() / 2))
     }
 
-    /// Returns the distance in pixels between neighbors of the grid, along a row and along a column.
-    pub fn stride(self) -> u32 {
-        self.stride
+    /// Returns the distance in pixels between neighbors of the grid along a row (`axis` 0) or along a column (`axis` 1).
+    pub fn stride(self, axis: usize) -> u32 {
+        self.strides[axis].get()
+    }
+
+    /// Returns whether the grid holds all pixels.
+    pub fn has_all_pixels(self) -> bool {
+        self.strides == ALL_PIXELS
     }
 
     /// Returns the numbers of columns and rows of the grid in an image of `size` = (width, height) pixels.
     pub fn size(self, size: [u32; 2]) -> [u32; 2] {
-        [0, 1].map(|axis| size[axis].saturating_sub(self.phase[axis]).div_ceil(self.stride))
+        [0, 1].map(|axis| size[axis].saturating_sub(self.phase[axis]).div_ceil(self.stride(axis)))
     }
 
     /// Returns the column of the image that is column `index` of the grid (`axis` 0), or the row of the image that is
     /// row `index` of the grid (`axis` 1).
     pub fn pixel(self, axis: usize, index: u32) -> u32 {
-        self.phase[axis] + self.stride * index
+        self.phase[axis] + self.stride(axis) * index
     }
 
     /// Returns the view of `camera` in which only the pixels of this grid are rendered.
@@ -67,7 +79,7 @@ impl PixelGrid {
     #[inline(always)]
     pub(super) fn tile_range(self, axis: usize, (start, end): (f64, f64), at: f64, half: f64, size: f64) -> (f64, f64) {
         const TILE_PIXELS: f64 = TILE as f64;
-        if self.stride == 1 {
+        if self.stride(axis) == 1 {
             return (start, end);
         }
         let first = (start * TILE_PIXELS).max((at - half).ceil());
@@ -75,7 +87,7 @@ impl PixelGrid {
         // Number of columns or rows of the grid before a pixel. The quotient of two 32-bit integers in f64 is rounded
         // to an integer only if it is one.
         let count_before =
-            |pixel: f64| ((pixel - f64::from(self.phase[axis])).max(0.0) / f64::from(self.stride)).ceil();
+            |pixel: f64| ((pixel - f64::from(self.phase[axis])).max(0.0) / f64::from(self.stride(axis))).ceil();
         let (first, last) = (count_before(first), count_before(last));
         let start = (first / TILE_PIXELS).floor();
         (start, if first < last { (last / TILE_PIXELS).ceil() } else { start })
@@ -105,7 +117,7 @@ mod tests {
     fn size_counts_the_pixels_of_the_grid() {
         for stride in 1..6 {
             for phase in 0..stride {
-                let grid = PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase, 0]);
+                let grid = PixelGrid::new([stride; 2].map(|stride| NonZeroU32::new(stride).unwrap()), [phase, 0]);
                 for width in 0..20 {
                     let expected = (0..width).filter(|x| x % stride == phase).count() as u32;
                     assert_eq!(grid.size([width, 1])[0], expected, "{width} columns, stride {stride}, phase {phase}");
@@ -116,9 +128,9 @@ mod tests {
 
     #[test]
     fn pixel_returns_the_pixels_of_the_grid_in_order() {
-        let grid = PixelGrid::new(NonZeroU32::new(3).unwrap(), [5, 1]);
+        let grid = PixelGrid::new([3, 2].map(|stride| NonZeroU32::new(stride).unwrap()), [5, 3]);
         assert_eq!([0, 1, 2].map(|index| grid.pixel(0, index)), [2, 5, 8]);
-        assert_eq!([0, 1, 2].map(|index| grid.pixel(1, index)), [1, 4, 7]);
+        assert_eq!([0, 1, 2].map(|index| grid.pixel(1, index)), [1, 3, 5]);
     }
 
     #[test]
@@ -126,7 +138,7 @@ mod tests {
         const SIZE: u32 = 150;
         let mut empty = 0;
         for (stride, phase) in [(2, 0), (3, 2), (5, 1), (7, 6)] {
-            let grid = PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase; 2]);
+            let grid = PixelGrid::new([stride; 2].map(|stride| NonZeroU32::new(stride).unwrap()), [phase; 2]);
             for step in -40..400 {
                 let at = 0.5 * f64::from(step) - 0.2;
                 for half in [0.1, 1.4, 9.0, 40.0] {

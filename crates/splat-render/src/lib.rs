@@ -62,7 +62,7 @@ mod renderer;
 pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 pub use contribution::Contribution;
 pub use features::blend_features;
-pub use grid::{PixelGrid, SampledView};
+pub use grid::{ALL_PIXELS, GridStrides, PixelGrid, SampledView};
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 

@@ -352,7 +352,7 @@ impl ProjectedSplats {
             y0: y0[i] as u32,
             y1: y1[i] as u32,
         };
-        let is_cut_off = view.grid.stride() > 1 && self.is_cut_off[i] != 0;
+        let is_cut_off = !view.grid.has_all_pixels() && self.is_cut_off[i] != 0;
         let splat = Splat {
             u: self.u[i],
             v: self.v[i],

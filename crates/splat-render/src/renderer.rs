@@ -214,7 +214,7 @@ impl Renderer {
         seen: &mut Contribution,
     ) {
         assert_eq!(seen.len(), gaussians.len(), "expected as many contributions as Gaussians");
-        let view = CameraTerms::new(PixelGrid::centered(stride).sampled_view(camera));
+        let view = CameraTerms::new(PixelGrid::centered([stride; 2]).sampled_view(camera));
         self.prepare(gaussians, &view, false);
         let task_count = self.task_count();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
@@ -449,11 +449,12 @@ mod tests {
         }
     }
 
-    /// Returns grids of pixels for tests: with strides from 2 to 5, each with all offsets of the first column and
-    /// several offsets of the first row.
+    /// Returns grids of pixels for tests: with several strides, each with all offsets of the first column and several
+    /// offsets of the first row.
     fn grids() -> impl Iterator<Item = PixelGrid> {
-        (2..6).flat_map(|stride| {
-            (0..stride).map(move |phase| PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase, 3 * phase + 1]))
+        [[2, 1], [1, 2], [2, 2], [3, 3], [4, 2], [5, 5]].into_iter().flat_map(|strides| {
+            let strides = strides.map(|stride| NonZeroU32::new(stride).unwrap());
+            (0..strides[0].get()).map(move |phase| PixelGrid::new(strides, [phase, 3 * phase + 1]))
         })
     }
 
@@ -492,8 +493,8 @@ mod tests {
             Renderer::new().gradient(&scene, view, [0.3; 3], loss, &mut gradients);
             gradients
         };
-        let stride = NonZeroU32::new(3).unwrap();
-        let phases = (0..9).map(|k| PixelGrid::new(stride, [k % 3, k / 3]));
+        let strides = [3, 2].map(|stride| NonZeroU32::new(stride).unwrap());
+        let phases = (0..6).map(|k| PixelGrid::new(strides, [k % 3, k / 3]));
         let parts: Vec<Gradients> = phases.map(|grid| gradient(grid.sampled_view(&camera))).collect();
         let whole = gradient((&camera).into());
         for column in Attributes::all().iter() {
@@ -512,7 +513,7 @@ mod tests {
         let (scene, camera) = scene();
         let results = |mut renderer: Renderer, grid: PixelGrid| {
             let mut seen = Contribution::new(scene.len());
-            renderer.contribution(&scene, &camera, NonZeroU32::new(grid.stride()).unwrap(), &mut seen);
+            renderer.contribution(&scene, &camera, NonZeroU32::new(grid.stride(0)).unwrap(), &mut seen);
             let mut errors = RemovalError::new(scene.len(), 0.1);
             renderer.removal_error(&scene, grid.sampled_view(&camera), [0.3; 3], &mut errors);
             let mut gradients = Gradients::new(scene.len(), Attributes::all(), 0);

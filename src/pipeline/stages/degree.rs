@@ -82,14 +82,15 @@ impl Degree {
         journal: &mut Journal,
     ) -> Result<ByteLimitFit> {
         let gaussian_count = scored.gaussian_count();
-        let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
+        let target_views = self.refine.target_views.with_frames(scored.frames_needed_to_see_all);
+        let key = scene.work.key(&(self.refine.key(), target_views, ranked, template, fits));
         journal.run_cached_stage(NAME, gaussian_count, scene, key, |journal| {
             let counts = CountPlan::new(Some(&self.refine), false);
             let initial_count =
                 |gaussians: usize| counts.count_before_refinement(gaussians, gaussian_count).min(ranked.order().len());
             let largest = fits.iter().map(|fit| initial_count(fit.gaussians)).max().unwrap_or_default();
             let strides = self.refine.stored_strides(scene.workload().pixels, largest);
-            let targets = Targets::new(scene, self.refine.target_views, strides, false)?;
+            let targets = Targets::new(scene, target_views, strides, false)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
                 let start = CompressedModel {

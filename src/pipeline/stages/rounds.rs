@@ -7,7 +7,6 @@
 //! The survivors of a round do not depend on the final number of Gaussians, so a smaller target keeps a subset of a
 //! larger one. Memory: see [`removal_error`].
 
-use std::num::NonZeroU32;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -27,6 +26,7 @@ use crate::pruning::Ranking;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
+use crate::render::GridStrides;
 use crate::scene::Scene;
 
 /// Name of this stage in plans, progress and summaries.
@@ -211,9 +211,9 @@ impl Rounds {
         let groups = self.view_groups(scene, scored);
         state.errors = vec![vec![0; scored.gaussian_count()]; groups.len()];
         // All rounds use the same pixels, because a round adds errors that earlier rounds measured.
-        let stride = pixel_stride(scene.workload().pixels, self.pixels_per_gaussian * first as f64);
+        let strides = [pixel_stride(scene.workload().pixels, self.pixels_per_gaussian * first as f64); 2];
         // The key does not depend on `fewest`, because the survivors of a round do not.
-        let key = scene.work.key(&(self.fraction, self.contrast_floor, &groups, &before, protected, stride));
+        let key = scene.work.key(&(self.fraction, self.contrast_floor, &groups, &before, protected, strides));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.is_enabled()) {
             if let Some(found) = scene.work.load(&entry_name(round), key.extended_by(&round))? {
@@ -226,7 +226,7 @@ impl Rounds {
         let progress = scene.events.task(NAME, "views", view_counts.sum::<usize>() as u64);
         let RoundState { free, removed, .. } = journal.run_stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
-                state = self.round(scene, scored, (state, &groups), round, (key, left, stride), &progress)?;
+                state = self.round(scene, scored, (state, &groups), round, (key, left, strides), &progress)?;
             }
             let left = state.free.len() + protected.len();
             Ok((state, left))
@@ -253,14 +253,14 @@ impl Rounds {
     /// - `round`: number of the round, from 0;
     /// - `key`: cache key of the whole ranking;
     /// - `left`: number of removable Gaussians that the round leaves;
-    /// - `stride`: only every `stride`-th pixel of a view in each direction is rendered.
+    /// - `strides`: strides of the grid of pixels that are rendered.
     fn round(
         &self,
         scene: &Scene,
         scored: &Scored,
         (mut state, groups): (RoundState, &[Vec<FrameView>]),
         round: usize,
-        (key, left, stride): (CacheKey, usize, NonZeroU32),
+        (key, left, strides): (CacheKey, usize, GridStrides),
         progress: &Progress,
     ) -> Result<RoundState> {
         let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
@@ -282,7 +282,7 @@ impl Rounds {
                 }
                 let rendered = (&scene.schedule.cameras[..], &views[range]);
                 let advance = || progress.advance(1);
-                Ok(removal_error(scene.source(), &ids, rendered, background, (floor, stride), scene.limits, advance)?
+                Ok(removal_error(scene.source(), &ids, rendered, background, (floor, strides), scene.limits, advance)?
                     .sum)
             };
             active.iter().map(group_errors).collect()

@@ -3,8 +3,6 @@
 //! measures the result, and asks for a repetition of the reduction with another number of Gaussians if too many bytes
 //! are left or missing. Finally it removes Gaussians until the result fits.
 
-use std::num::NonZeroU32;
-
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -22,6 +20,7 @@ use crate::pruning::Ranking;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
 use crate::recipe::FieldPrecision;
+use crate::render::ALL_PIXELS;
 use crate::scene::Scene;
 
 /// Name of both stages in plans, progress and summaries.
@@ -301,7 +300,7 @@ impl ByteLimit {
         let views = select_evenly(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
         let looked_at = (&scene.schedule.cameras[..], &views[..]);
         let errors =
-            removal_error(&*result, &places, looked_at, scene.background, (0.0, NonZeroU32::MIN), scene.limits, || ())?;
+            removal_error(&*result, &places, looked_at, scene.background, (0.0, ALL_PIXELS), scene.limits, || ())?;
         Ok(errors.top_by_error(count, |place| scored.is_protected(compressed.kept[place])))
     }
 }
