@@ -221,6 +221,11 @@ impl CompressedModel {
         }
     }
 
+    /// Returns the indices in [`CompressedModel::kept`] of the ids `ids`, in their order; `None` if an id is not kept.
+    pub(crate) fn indices(&self, ids: &[u32]) -> Option<Vec<u32>> {
+        ids.iter().map(|id| self.kept.binary_search(id).ok().map(|index| index as u32)).collect()
+    }
+
     /// Returns a copy of this model in which the list of kept Gaussians is replaced by `kept` (increasing ids of the
     /// input).
     pub fn with_kept(&self, kept: Vec<u32>) -> Self {

@@ -15,6 +15,7 @@
 //! [`RefineStage::resource_estimate`]), and the best parameter delta so far. The target views and the states at their
 //! frames are in scratch files.
 
+mod epoch_sampler;
 mod linearized;
 mod loss;
 mod mean_delta;

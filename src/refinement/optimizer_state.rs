@@ -527,11 +527,23 @@ impl<'a> OptimizerState<'a> {
     /// # Errors
     /// Fails if a scratch file cannot be read.
     pub(super) fn quality(&self, views: &[usize]) -> Result<RenderQuality> {
+        self.quality_of(views, None)
+    }
+
+    /// Returns the mean quality of the validation or test views with the indices `views`, like
+    /// [`OptimizerState::quality`], for renders of only the Gaussians with the indices `places`, increasing; `None`: of
+    /// all Gaussians.
+    ///
+    /// # Errors
+    /// Fails if a scratch file cannot be read.
+    pub(super) fn quality_of(&self, views: &[usize], places: Option<&[u32]>) -> Result<RenderQuality> {
         let delta = self.rendered_delta();
         let errors = |(renderer, now): &mut (Renderer, LinearizedState), &k: &usize| {
             self.compute_state(self.frame_index(k), &delta, now)?;
             let (view, values) = (self.targets.view(k, self.strides), self.targets.values(k, self.strides)?);
-            let image = renderer.render(&now.state, view, self.scene.background);
+            let picked = places.map(|places| now.pick(places));
+            let state = picked.as_ref().map_or(&now.state, |picked| &picked.state);
+            let image = renderer.render(state, view, self.scene.background);
             Ok(self.step_params.loss.errors(&image, &values))
         };
         let parts = views.par_iter().with_min_len(self.views_per_part(views.len()));

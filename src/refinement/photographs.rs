@@ -89,7 +89,8 @@ impl RefineStage {
             let held_back = targets.split().validation.len();
             // The notes of a refinement are about renders of the original, so they are not taken over.
             let mut own = Journal::default();
-            let result = RefineRun::new(NAME, self, scene, scored, &targets).refine_best(compressed, &mut own)?;
+            let mut refinement = RefineRun::new(NAME, self, scene, scored, &targets);
+            let result = refinement.refine_best(compressed.clone(), None, &mut own)?.unwrap_or(compressed);
             match own.refined {
                 Some(found) => {
                     let (before, result) = (found.before, found.result);

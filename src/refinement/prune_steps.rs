@@ -25,20 +25,29 @@ impl<'a> PrunedModels<'a> {
         PrunedModels { refinement, models: Vec::new(), first: 0 }
     }
 
-    /// Returns a refined model of `size` Gaussians. Prunes a larger model by optimization and prune steps, then runs
-    /// the final optimization steps. The larger model is the smallest sufficient one that earlier calls have stored or,
-    /// if there is none, `start`: the Gaussians that ranking keeps. If `start` has more Gaussians than the model with
-    /// which earlier calls began, their models are dropped first. Notes for the user are added to `journal`, the record
-    /// of the run.
+    /// Returns a refined model. Prunes a larger model by optimization and prune steps, then runs the final optimization
+    /// steps. `unrefined`: ids of the Gaussians that ranking alone keeps, increasing, as many as are to stay; if the
+    /// model of these, unchanged, has better renders of the validation views, it is the result. The larger model is the
+    /// smallest sufficient one that earlier calls have stored or, if there is none, `start`: the Gaussians that ranking
+    /// keeps. If `start` has more Gaussians than the model with which earlier calls began, their models are dropped
+    /// first. Notes for the user are added to `journal`, the record of the run.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
     pub(crate) fn refined(
         &mut self,
         start: CompressedModel,
-        size: usize,
+        unrefined: &[u32],
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
+        let size = unrefined.len();
+        let unrefined = (start.len() > size).then(|| start.with_kept(unrefined.to_vec()));
+        let quality = unrefined.as_ref().map(|unrefined| self.refinement.validation_quality(unrefined)).transpose()?;
+        if let Some(unrefined) = unrefined.as_ref()
+            && self.refinement.is_good_enough(quality.as_ref(), journal)
+        {
+            return Ok(unrefined.clone());
+        }
         if start.len() > self.first {
             (self.first, self.models) = (start.len(), Vec::new());
         }
@@ -51,7 +60,8 @@ impl<'a> PrunedModels<'a> {
                 self.models.push(model.clone());
             }
         }
-        self.refinement.refine_best(model, journal)
+        let refined = self.refinement.refine_best(model.clone(), quality, journal)?;
+        Ok(refined.or(unrefined).unwrap_or(model))
     }
 }
 

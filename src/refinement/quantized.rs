@@ -6,10 +6,10 @@
 //! other values that are quantized and stay as they are, render close to the target views.
 
 use super::RefineStage;
+use super::epoch_sampler::EpochSampler;
 use super::mean_delta::{MeanDelta, is_averaged};
 use super::optimizer::RateSchedule;
 use super::optimizer_state::OptimizerState;
-use super::run::EpochSampler;
 use super::targets::{Targets, ViewSplit};
 use crate::archive::CloudSteps;
 use crate::compressed_model::ParamDelta;

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
+use super::epoch_sampler::EpochSampler;
 use super::loss::RenderQuality;
 use super::mean_delta::{MeanDelta, is_averaged};
 use super::optimizer::RateSchedule;
@@ -20,7 +21,6 @@ use crate::metrics::decibels_text;
 use crate::progress::Progress;
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
-use crate::scene::views_between::SplitMix64;
 use crate::source::FrameSource;
 
 /// Minimum and maximum number of optimization steps between two renderings of the validation views. Within these limits
@@ -42,10 +42,11 @@ const LAST_RATE_BEFORE_PRUNING: f32 = 1.0;
 const LAST_RATE_OF_FINAL_STEPS: f32 = 0.2;
 
 impl RefineStage {
-    /// Prunes the model `compressed` in prune steps to `target_count` Gaussians and refines it. Returns the model with
-    /// the parameters that have the best quality on the validation views. Protected Gaussians (which the user keeps)
-    /// are not changed. `scored`: ranking and protected Gaussians. `journal` gets notes for the user, and the reason if
-    /// nothing was done.
+    /// Prunes the model `compressed` in prune steps and refines it. Returns the model with the parameters that have the
+    /// best quality on the validation views. Protected Gaussians (which the user keeps) are not changed. `unrefined`:
+    /// ids of the Gaussians that ranking alone keeps, increasing, as many as are to stay; the result holds these,
+    /// unchanged, if refinement gives no better quality. `scored`: ranking and protected Gaussians. `journal` gets notes
+    /// for the user, and the reason if nothing was done.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -54,10 +55,10 @@ impl RefineStage {
         scene: &Scene,
         scored: &Scored,
         compressed: CompressedModel,
-        target_count: usize,
+        unrefined: &[u32],
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let count = compressed.len();
+        let (count, target_count) = (compressed.len(), unrefined.len());
         let steps = self.final_step_count(target_count, scored.gaussian_count());
         if count == 0 || scene.schedule.pair_count() == 0 {
             journal.leave_out("refinement", "there are no Gaussians or no views");
@@ -68,20 +69,20 @@ impl RefineStage {
             return Ok(compressed);
         }
         let target_views = self.target_views.with_frames(scored.frames_needed_to_see_all);
-        let key = scene.work.key(&(self.key(), target_views, &compressed, target_count, steps, &scored.protected));
+        let key = scene.work.key(&(self.key(), target_views, &compressed, unrefined, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, count, scene.source(), |journal| {
                 let strides = self.stored_strides(scene.workload().pixels, count);
                 let targets = Targets::new(scene, target_views, strides, false)?;
                 scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets);
-                Ok((run.run_all(&compressed, target_count, steps, journal)?.0, target_count))
+                Ok((run.run_all(&compressed, unrefined, steps, journal)?.0, target_count))
             })
         };
         journal.cached(&scene.work, NAME, key, run)
     }
 
-    /// Refines the model `compressed` to `target_count` Gaussians like [`RefineStage::run`], as part of the stage named
+    /// Refines the model `compressed` like [`RefineStage::run`], which explains `unrefined`, as part of the stage named
     /// `stage`, with the target views `targets`. Returns only the mean PSNR, dB, of the refined model against the
     /// original on the validation views.
     ///
@@ -94,52 +95,14 @@ impl RefineStage {
         scored: &Scored,
         targets: &Targets,
         compressed: &CompressedModel,
-        target_count: usize,
+        unrefined: &[u32],
     ) -> Result<f64> {
+        let target_count = unrefined.len();
         let steps = self.final_step_count(target_count, scored.gaussian_count());
         let mut run = RefineRun::new(stage, self, scene, scored, targets);
-        let key = run.key(compressed, target_count, target_count).extended_by(&steps);
-        let all = || Ok(run.run_all(compressed, target_count, steps, &mut Journal::default())?.1);
+        let key = run.key(compressed, target_count, target_count).extended_by(&(steps, unrefined));
+        let all = || Ok(run.run_all(compressed, unrefined, steps, &mut Journal::default())?.1);
         scene.work.get_or_compute(&format!("{stage}-size"), key, all)
-    }
-}
-
-/// Random order in which training views are used. Each epoch takes all of them once, in a new order.
-pub(super) struct EpochSampler {
-    views: Vec<usize>,
-    at: usize,
-    random: SplitMix64,
-    /// Number of views taken from the random order so far, over all epochs.
-    taken: usize,
-}
-
-impl EpochSampler {
-    pub(super) fn new(views: Vec<usize>) -> EpochSampler {
-        EpochSampler { at: views.len(), views, random: SplitMix64(1), taken: 0 }
-    }
-
-    pub(super) fn next(&mut self) -> usize {
-        let view = self.peek();
-        self.at += 1;
-        self.taken += 1;
-        view
-    }
-
-    /// Returns the view that [`EpochSampler::next`] will return.
-    pub(super) fn peek(&mut self) -> usize {
-        if self.at == self.views.len() {
-            self.random.shuffle(&mut self.views);
-            self.at = 0;
-        }
-        self.views[self.at]
-    }
-
-    /// Skips views of the random order until `steps` views have been taken since the beginning. Used to continue an
-    /// interrupted run.
-    fn skip_to(&mut self, steps: usize) {
-        while self.taken < steps {
-            self.next();
-        }
     }
 }
 
@@ -254,18 +217,30 @@ impl<'a> RefineRun<'a> {
         CheckpointTimer { key, phase: 0, saved_at: Instant::now(), interval: CHECKPOINT_INTERVAL[0] }
     }
 
-    /// Prunes `compressed` to `target_count` Gaussians in prune steps and then runs `steps` final optimization steps.
-    /// Returns the refined model, and the mean PSNR, dB, of its renders of the validation views against the original.
+    /// Prunes `compressed` in prune steps to as many Gaussians as `unrefined` has ids, and then runs `steps` final
+    /// optimization steps. Returns the refined model, and the mean PSNR, dB, of its renders of the validation views
+    /// against the original. If only the Gaussians with the ids `unrefined`, unchanged, give renders of better quality,
+    /// the result holds these. If their PSNR is at least [`MAX_USEFUL_PSNR`], no step is made.
     fn run_all(
         &mut self,
         compressed: &CompressedModel,
-        target_count: usize,
+        unrefined: &[u32],
         steps: usize,
         journal: &mut Journal,
     ) -> Result<(CompressedModel, f64)> {
+        let target_count = unrefined.len();
         let mut timer = self.timer(self.key(compressed, target_count, target_count).extended_by(&steps));
         let result = self.scene.input.compressed_frames(compressed)?;
         let mut optimizer = self.start_optimizer(compressed, &*result)?;
+        let unrefined = compressed.indices(unrefined).filter(|_| target_count < compressed.len());
+        let unrefined_quality =
+            unrefined.as_deref().map(|places| optimizer.quality_of(&self.validation, Some(places))).transpose()?;
+        let unrefined = unrefined.zip(unrefined_quality);
+        if let Some((places, quality)) = &unrefined
+            && self.is_good_enough(Some(quality), journal)
+        {
+            return Ok((compressed.pick(places), quality.psnr));
+        }
         let prune_counts = prune_counts(compressed.len(), target_count);
         let prune_steps_total: usize =
             prune_counts.windows(2).map(|pair| self.refine.steps_before(pair[0], target_count)).sum();
@@ -276,7 +251,12 @@ impl<'a> RefineRun<'a> {
             left = left.pick(&self.prune_step(&mut optimizer, &mut timer, steps, pair[1])?);
         }
         let BestDeltas { delta, trajectory, best, .. } =
-            self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
+            self.final_steps(&mut optimizer, &mut timer, steps, unrefined_quality, journal)?;
+        if let Some((places, quality)) = &unrefined
+            && !self.keeps(&best, quality)
+        {
+            return Ok((compressed.pick(places), quality.psnr));
+        }
         (left.delta, left.trajectory_delta) = (left.delta.plus(delta), left.trajectory_delta.plus(trajectory));
         Ok((left, best.psnr))
     }
@@ -304,27 +284,45 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
+    /// Returns the quality of renders of the validation views with the model `compressed`.
+    ///
+    /// # Errors
+    /// Fails if a frame cannot be read or a scratch file cannot be written.
+    pub(super) fn validation_quality(&self, compressed: &CompressedModel) -> Result<RenderQuality> {
+        let key = self.key.extended_by(&(compressed, "unrefined"));
+        self.scene.work.get_or_compute(&format!("{}-unrefined", self.stage), key, || {
+            let result = self.scene.input.compressed_frames(compressed)?;
+            self.start_optimizer(compressed, &*result)?.quality(&self.validation)
+        })
+    }
+
     /// Runs the final optimization steps on the model `compressed`. Returns this model with the parameter deltas that
-    /// have given the best validation quality.
-    pub(crate) fn refine_best(
+    /// have given the best validation quality. `unrefined`: quality of another model with as many Gaussians, which
+    /// ranking alone keeps. Returns `None` if it is better.
+    pub(super) fn refine_best(
         &mut self,
         mut compressed: CompressedModel,
+        unrefined: Option<RenderQuality>,
         journal: &mut Journal,
-    ) -> Result<CompressedModel> {
+    ) -> Result<Option<CompressedModel>> {
         let steps = self.refine.final_step_count(compressed.len(), self.scored.gaussian_count());
-        let (key, work) = (self.key(&compressed, compressed.len(), compressed.len()), &self.scene.work);
-        let (delta, trajectory, taken) = journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
-            self.set_total_steps(steps + self.steps_along_time(steps));
-            let mut timer = self.timer(key);
-            let result = self.scene.input.compressed_frames(&compressed)?;
-            let mut optimizer = self.start_optimizer(&compressed, &*result)?;
-            let BestDeltas { delta, trajectory, .. } = self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
-            Ok((delta, trajectory, self.sampler.taken))
-        })?;
+        let key = self.key(&compressed, compressed.len(), compressed.len());
+        let (key, work) = (key.extended_by(&unrefined.map(|quality| quality.psnr.to_bits())), &self.scene.work);
+        let (delta, trajectory, is_better, taken) =
+            journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
+                self.set_total_steps(steps + self.steps_along_time(steps));
+                let mut timer = self.timer(key);
+                let result = self.scene.input.compressed_frames(&compressed)?;
+                let mut optimizer = self.start_optimizer(&compressed, &*result)?;
+                let BestDeltas { delta, trajectory, best, .. } =
+                    self.final_steps(&mut optimizer, &mut timer, steps, unrefined, journal)?;
+                let is_better = unrefined.is_none_or(|unrefined| self.keeps(&best, &unrefined));
+                Ok((delta, trajectory, is_better, self.sampler.taken))
+            })?;
         self.sampler.skip_to(taken);
         (compressed.delta, compressed.trajectory_delta) =
             (compressed.delta.plus(delta), compressed.trajectory_delta.plus(trajectory));
-        Ok(compressed)
+        Ok(is_better.then_some(compressed))
     }
 
     /// Returns the number of keyframes of the time-varying delta; 0 if the added values are constant in time, as for
@@ -439,12 +437,14 @@ impl<'a> RefineRun<'a> {
 
     /// Runs `steps` optimization steps of the constant delta, then the steps of the time-varying delta. Returns the
     /// deltas with the best validation quality. Records in `journal` the gain in validation PSNR, or the reason why
-    /// nothing was gained.
+    /// nothing was gained. `unrefined`: quality of another model with as many Gaussians, which ranking alone keeps; the
+    /// gain is the gain over the better one of this model and the model before the steps.
     fn final_steps(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
         timer: &mut CheckpointTimer,
         steps: usize,
+        unrefined: Option<RenderQuality>,
         journal: &mut Journal,
     ) -> Result<BestDeltas> {
         let count = self.validation.len();
@@ -454,14 +454,7 @@ impl<'a> RefineRun<'a> {
                 optimizer.reevaluate_states()?;
                 let before = optimizer.quality(&self.validation)?;
                 let best_deltas = BestDeltas::new(before, optimizer.change());
-                if before.psnr.is_nan() || before.psnr >= MAX_USEFUL_PSNR {
-                    let why = match before.psnr.is_nan() {
-                        true => {
-                            format!("the PSNR of the {count} validation views is {}", decibels_text(before.psnr, 2))
-                        }
-                        false => format!("the {count} validation views have {:.2} dB PSNR without it", before.psnr),
-                    };
-                    journal.leave_out("refinement", why);
+                if self.is_good_enough(Some(&before), journal) {
                     return Ok(best_deltas);
                 }
                 (0, RateSchedule::new(steps, LAST_RATE_OF_FINAL_STEPS, before.typical_error()), best_deltas)
@@ -496,8 +489,11 @@ impl<'a> RefineRun<'a> {
             self.save_checkpoint(optimizer, timer, (step, schedule), Some(&best_deltas))?;
         }
         let is_along = self.refine_along_time(optimizer, timer, (done, schedule), &mut best_deltas, steps)?;
-        let [start, best] = [best_deltas.before.psnr, best_deltas.best.psnr];
-        if self.keeps(&best_deltas.best, &best_deltas.before) {
+        let start = unrefined.filter(|unrefined| self.refine.loss.is_closer(unrefined, &best_deltas.before));
+        let start = start.unwrap_or(best_deltas.before);
+        let is_better = self.keeps(&best_deltas.best, &start);
+        let [start, best] = [start.psnr, best_deltas.best.psnr];
+        if is_better {
             journal.notes.push(format!("refinement: validation PSNR {start:.2} → {best:.2} dB ({count} views)"));
             journal.refined = Some(RefinedSummary { views: count, before: start, result: best });
         } else {
@@ -512,6 +508,21 @@ impl<'a> RefineRun<'a> {
             journal.leave_out("changes along time", why);
         }
         Ok(best_deltas)
+    }
+
+    /// Returns whether a model whose renders of the validation views have the quality `quality` needs no refinement:
+    /// their PSNR is at least [`MAX_USEFUL_PSNR`], or not a number. Records in `journal` that refinement is left out.
+    pub(super) fn is_good_enough(&self, quality: Option<&RenderQuality>, journal: &mut Journal) -> bool {
+        let (count, psnr) = (self.validation.len(), quality.map_or(0.0, |quality| quality.psnr));
+        if psnr < MAX_USEFUL_PSNR {
+            return false;
+        }
+        let why = match psnr.is_nan() {
+            true => format!("the PSNR of the {count} validation views is {}", decibels_text(psnr, 2)),
+            false => format!("the {count} validation views have {psnr:.2} dB PSNR without it"),
+        };
+        journal.leave_out("refinement", why);
+        true
     }
 
     /// Returns whether the current parameters, of validation quality `now`, replace the best parameters so far, of

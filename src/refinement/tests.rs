@@ -41,7 +41,7 @@ fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (Compre
     let compressed = CompressedModel::pruned(scored.ranking().best_ids(count), &recipe.merge);
     let mut journal = Journal::default();
     let refine = RefineStage { steps, ..RefineStage::from_recipe(&recipe, None, false).unwrap() };
-    (refine.run(scene, &scored, compressed, count, &mut journal).unwrap(), journal)
+    (refine.run(scene, &scored, compressed.clone(), &compressed.kept, &mut journal).unwrap(), journal)
 }
 
 /// Returns the mean PSNR in dB of renders of `compressed` over the test views of `rig`, compared with renders of the
@@ -130,7 +130,7 @@ fn interrupted_runs_resume_to_the_same_result() {
                 target_views: TargetViewParams::at_most(target_views),
                 ..RefineStage::from_recipe(&recipe, None, true).unwrap()
             };
-            few.run(scene, &scored, compressed, count / 4, &mut Journal::default())
+            few.run(scene, &scored, compressed, &scored.ranking().best_ids(count / 4), &mut Journal::default())
         };
         let start = Instant::now();
         let expected = run(&open(None)).unwrap();
@@ -212,7 +212,7 @@ fn leaving_out_absent_gaussians_changes_no_result() {
         let compressed = CompressedModel::pruned(scored.ranking().best_ids(600), &recipe.merge);
         let few =
             RefineStage { steps: 100, steps_per_prune: 40, ..RefineStage::from_recipe(&recipe, None, true).unwrap() };
-        few.run(&scene, &scored, compressed, 250, &mut Journal::default()).unwrap()
+        few.run(&scene, &scored, compressed, &scored.ranking().best_ids(250), &mut Journal::default()).unwrap()
     });
     assert!(!away.delta.is_empty() && away.delta == unseen.delta);
     assert_eq!(away.kept, unseen.kept);
@@ -257,7 +257,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
                 keyframes: keyframe_count,
                 ..RefineStage::from_recipe(&recipe, None, false).unwrap()
             };
-            few.run(&scene, &scored, compressed, kept.len(), &mut Journal::default()).unwrap()
+            few.run(&scene, &scored, compressed, &kept, &mut Journal::default()).unwrap()
         });
         assert_eq!((constant.trajectory_delta.0.len(), varying.trajectory_delta.0.len()), (0, 4));
         assert!(varying.delta == constant.delta, "{name}");
@@ -300,7 +300,7 @@ fn fixed_higher_sh_degrees_stay_unchanged() {
     let (mut journal, count) = (Journal::default(), compressed.len());
     let refine =
         RefineStage { steps: 100, ..RefineStage::from_recipe(&recipe, None, false).unwrap() }.with_fixed_higher_sh();
-    let moved = refine.run(&scene, &scored, compressed, count, &mut journal).unwrap();
+    let moved = refine.run(&scene, &scored, compressed.clone(), &compressed.kept, &mut journal).unwrap();
     assert_eq!((moved.delta.0.sh.width(), moved.delta.0.sh.len()), (3, count));
     assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");
 }
@@ -472,7 +472,10 @@ fn without_validation_a_worse_result_stays() {
         let mut refine = RefineStage::from_recipe(&recipe, None, false).unwrap();
         (refine.steps, refine.target_views, refine.validates) = (2000, TargetViewParams::at_most(12), validates);
         let mut journal = Journal::default();
-        (refine.run(&scene, &scored, compressed.clone(), count, &mut journal).unwrap().delta.is_empty(), journal)
+        (
+            refine.run(&scene, &scored, compressed.clone(), &compressed.kept, &mut journal).unwrap().delta.is_empty(),
+            journal,
+        )
     };
     let (is_unchanged, journal) = result(true);
     assert!(
@@ -483,6 +486,31 @@ fn without_validation_a_worse_result_stays() {
     );
     let (is_unchanged, journal) = result(false);
     assert!(!is_unchanged && journal.left_out.is_empty(), "{:?}", journal.left_out);
+}
+
+#[test]
+fn the_gaussians_of_the_ranking_stay_if_prune_steps_give_a_worse_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let recipe = Recipe::preset("default").unwrap();
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+    let ranking = scored.ranking();
+    let count = scored.gaussian_count();
+    let refine = RefineStage {
+        steps: 2000,
+        steps_per_prune: 2000,
+        target_views: TargetViewParams::at_most(12),
+        ..RefineStage::from_recipe(&recipe, None, true).unwrap()
+    };
+    // Without 100 Gaussians, renders are so good that no step is made. Without 200, steps overfit the few target views.
+    for (removed, reason) in [(100, "dB PSNR without it"), (200, "did not improve")] {
+        let unrefined = ranking.best_ids(count - removed);
+        let start = CompressedModel::pruned(ranking.best_ids(count - 20), &recipe.merge);
+        let mut journal = Journal::default();
+        let result = refine.run(&scene, &scored, start, &unrefined, &mut journal).unwrap();
+        assert!(journal.left_out[0].why.contains(reason), "{:?} {:?}", journal.left_out, journal.notes);
+        assert!(result.kept == unrefined && result.delta.is_empty(), "{removed} removed");
+    }
 }
 
 #[test]

@@ -97,7 +97,14 @@ impl Degree {
                     sh_degree: fit.sh_degree,
                     ..template.with_kept(ranked.best_ids(initial_count(fit.gaussians)))
                 };
-                let psnr = self.refine.validation_psnr(NAME, scene, scored, &targets, &start, fit.gaussians)?;
+                let psnr = self.refine.validation_psnr(
+                    NAME,
+                    scene,
+                    scored,
+                    &targets,
+                    &start,
+                    &ranked.best_ids(fit.gaussians),
+                )?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));
                 if is_no_better {

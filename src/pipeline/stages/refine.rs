@@ -51,11 +51,13 @@ impl Stage for RefineStage {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
         let wanted = run.refine_to.min(run.result.len());
         let start = run.take_result();
+        // Without prune steps, all Gaussians stay.
+        let unrefined = if wanted < start.len() { ranking.best_ids(wanted) } else { start.kept.clone() };
         run.result = match &mut run.prune_steps {
-            None => self.run(run.scene, &scored, start, wanted, &mut run.journal)?,
+            None => self.run(run.scene, &scored, start, &unrefined, &mut run.journal)?,
             // A model with all Gaussians needs no refinement.
             Some(_) if wanted >= ranking.order().len() => start,
-            Some(steps) => steps.refined(start, wanted, &mut run.journal)?,
+            Some(steps) => steps.refined(start, &unrefined, &mut run.journal)?,
         };
         Ok(())
     }
