@@ -517,13 +517,13 @@ fn the_gaussians_of_the_ranking_stay_if_prune_steps_give_a_worse_model() {
 fn strides_leave_enough_pixels_per_gaussian() {
     let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, true).unwrap();
     let strides = |pixels, survivors| refine.strides(pixels, survivors).map(NonZeroU32::get);
-    assert_eq!([strides(82_944, 22_000), strides(82_944, 8354), strides(82_944, 4177)], [[2, 1], [2, 2], [3, 3]]);
-    assert_eq!([strides(1_370_928, 60_000), strides(1_370_928, 20_000)], [[4, 3], [4, 4]]);
+    assert_eq!([strides(82_944, 22_000), strides(82_944, 8354), strides(82_944, 4177)], [[1, 1], [2, 1], [3, 2]]);
+    assert_eq!([strides(1_370_928, 60_000), strides(1_370_928, 20_000)], [[3, 3], [4, 4]]);
     assert_eq!([strides(0, 10), strides(100, 0), strides(u64::MAX, 1)], [[1, 1], [4, 4], [4, 4]]);
     // Values are stored for a third of the first survivors, because prune steps will remove most.
     let stored = refine.stored_strides(82_944, 8354);
     assert_eq!(stored.training.map(NonZeroU32::get), strides(82_944, 8354 / 3));
-    assert_eq!([stored.training, stored.validation].map(|strides| strides.map(NonZeroU32::get)), [[4, 4], [2, 2]]);
+    assert_eq!([stored.training, stored.validation].map(|strides| strides.map(NonZeroU32::get)), [[3, 3], [2, 2]]);
     let with_ssim = RefineStage { loss: Loss { ssim: 0.5 }, ..refine }.stored_strides(82_944, 8354);
     assert_eq!([with_ssim.training, with_ssim.validation], [ALL_PIXELS; 2]);
 }
