@@ -89,8 +89,7 @@ impl RefineStage {
             let held_back = targets.split().validation.len();
             // The notes of a refinement are about renders of the original, so they are not taken over.
             let mut own = Journal::default();
-            let mut refinement = RefineRun::new(NAME, self, scene, scored, &targets);
-            let result = refinement.refine_best(compressed.clone(), None, &mut own)?.unwrap_or(compressed);
+            let result = RefineRun::new(NAME, self, scene, scored, &targets).refine_best(compressed, None, &mut own)?;
             match own.refined {
                 Some(found) => {
                     let (before, result) = (found.before, found.result);

@@ -41,13 +41,17 @@ impl<'a> PrunedModels<'a> {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let size = unrefined.len();
-        let unrefined = (start.len() > size).then(|| start.with_kept(unrefined.to_vec()));
-        let quality = unrefined.as_ref().map(|unrefined| self.refinement.validation_quality(unrefined)).transpose()?;
-        if let Some(unrefined) = unrefined.as_ref()
-            && self.refinement.is_good_enough(quality.as_ref(), journal)
-        {
-            return Ok(unrefined.clone());
-        }
+        let unrefined = match start.len() > size {
+            true => {
+                let model = start.with_kept(unrefined.to_vec());
+                let quality = self.refinement.validation_quality(&model)?;
+                if self.refinement.is_good_enough(&quality, journal) {
+                    return Ok(model);
+                }
+                Some((model, quality))
+            }
+            false => None,
+        };
         if start.len() > self.first {
             (self.first, self.models) = (start.len(), Vec::new());
         }
@@ -60,8 +64,7 @@ impl<'a> PrunedModels<'a> {
                 self.models.push(model.clone());
             }
         }
-        let refined = self.refinement.refine_best(model.clone(), quality, journal)?;
-        Ok(refined.or(unrefined).unwrap_or(model))
+        self.refinement.refine_best(model, unrefined, journal)
     }
 }
 

@@ -217,10 +217,10 @@ impl<'a> RefineRun<'a> {
         CheckpointTimer { key, phase: 0, saved_at: Instant::now(), interval: CHECKPOINT_INTERVAL[0] }
     }
 
-    /// Prunes `compressed` in prune steps to as many Gaussians as `unrefined` has ids, and then runs `steps` final
-    /// optimization steps. Returns the refined model, and the mean PSNR, dB, of its renders of the validation views
-    /// against the original. If only the Gaussians with the ids `unrefined`, unchanged, give renders of better quality,
-    /// the result holds these. If their PSNR is at least [`MAX_USEFUL_PSNR`], no step is made.
+    /// Prunes `compressed` in prune steps and then runs `steps` final optimization steps. Returns the refined model, and
+    /// the mean PSNR, dB, of its renders of the validation views against the original. `unrefined`: ids of the Gaussians
+    /// that ranking alone keeps; as many are left after the last prune step. If the model of these, unchanged, has a
+    /// better validation quality, it is returned. If its PSNR is at least [`MAX_USEFUL_PSNR`], no step is made.
     fn run_all(
         &mut self,
         compressed: &CompressedModel,
@@ -237,7 +237,7 @@ impl<'a> RefineRun<'a> {
             unrefined.as_deref().map(|places| optimizer.quality_of(&self.validation, Some(places))).transpose()?;
         let unrefined = unrefined.zip(unrefined_quality);
         if let Some((places, quality)) = &unrefined
-            && self.is_good_enough(Some(quality), journal)
+            && self.is_good_enough(quality, journal)
         {
             return Ok((compressed.pick(places), quality.psnr));
         }
@@ -297,17 +297,18 @@ impl<'a> RefineRun<'a> {
     }
 
     /// Runs the final optimization steps on the model `compressed`. Returns this model with the parameter deltas that
-    /// have given the best validation quality. `unrefined`: quality of another model with as many Gaussians, which
-    /// ranking alone keeps. Returns `None` if it is better.
+    /// have given the best validation quality. `unrefined`: the model of as many Gaussians that ranking alone keeps, and
+    /// its validation quality; it is returned if its quality is better.
     pub(super) fn refine_best(
         &mut self,
         mut compressed: CompressedModel,
-        unrefined: Option<RenderQuality>,
+        unrefined: Option<(CompressedModel, RenderQuality)>,
         journal: &mut Journal,
-    ) -> Result<Option<CompressedModel>> {
+    ) -> Result<CompressedModel> {
+        let quality = unrefined.as_ref().map(|(_, quality)| *quality);
         let steps = self.refine.final_step_count(compressed.len(), self.scored.gaussian_count());
         let key = self.key(&compressed, compressed.len(), compressed.len());
-        let (key, work) = (key.extended_by(&unrefined.map(|quality| quality.psnr.to_bits())), &self.scene.work);
+        let (key, work) = (key.extended_by(&quality.map(|quality| quality.psnr.to_bits())), &self.scene.work);
         let (delta, trajectory, is_better, taken) =
             journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
                 self.set_total_steps(steps + self.steps_along_time(steps));
@@ -315,14 +316,14 @@ impl<'a> RefineRun<'a> {
                 let result = self.scene.input.compressed_frames(&compressed)?;
                 let mut optimizer = self.start_optimizer(&compressed, &*result)?;
                 let BestDeltas { delta, trajectory, best, .. } =
-                    self.final_steps(&mut optimizer, &mut timer, steps, unrefined, journal)?;
-                let is_better = unrefined.is_none_or(|unrefined| self.keeps(&best, &unrefined));
+                    self.final_steps(&mut optimizer, &mut timer, steps, quality, journal)?;
+                let is_better = quality.is_none_or(|quality| self.keeps(&best, &quality));
                 Ok((delta, trajectory, is_better, self.sampler.taken))
             })?;
         self.sampler.skip_to(taken);
         (compressed.delta, compressed.trajectory_delta) =
             (compressed.delta.plus(delta), compressed.trajectory_delta.plus(trajectory));
-        Ok(is_better.then_some(compressed))
+        Ok(unrefined.filter(|_| !is_better).map_or(compressed, |(unrefined, _)| unrefined))
     }
 
     /// Returns the number of keyframes of the time-varying delta; 0 if the added values are constant in time, as for
@@ -454,7 +455,7 @@ impl<'a> RefineRun<'a> {
                 optimizer.reevaluate_states()?;
                 let before = optimizer.quality(&self.validation)?;
                 let best_deltas = BestDeltas::new(before, optimizer.change());
-                if self.is_good_enough(Some(&before), journal) {
+                if self.is_good_enough(&before, journal) {
                     return Ok(best_deltas);
                 }
                 (0, RateSchedule::new(steps, LAST_RATE_OF_FINAL_STEPS, before.typical_error()), best_deltas)
@@ -512,8 +513,8 @@ impl<'a> RefineRun<'a> {
 
     /// Returns whether a model whose renders of the validation views have the quality `quality` needs no refinement:
     /// their PSNR is at least [`MAX_USEFUL_PSNR`], or not a number. Records in `journal` that refinement is left out.
-    pub(super) fn is_good_enough(&self, quality: Option<&RenderQuality>, journal: &mut Journal) -> bool {
-        let (count, psnr) = (self.validation.len(), quality.map_or(0.0, |quality| quality.psnr));
+    pub(super) fn is_good_enough(&self, quality: &RenderQuality, journal: &mut Journal) -> bool {
+        let (count, psnr) = (self.validation.len(), quality.psnr);
         if psnr < MAX_USEFUL_PSNR {
             return false;
         }
