@@ -80,6 +80,11 @@ impl ReadPlan {
         self.max_kept_frames
     }
 
+    /// Returns whether exactly one frame is planned.
+    pub fn is_single_frame(&self) -> bool {
+        self.frames.as_ref().is_some_and(|frames| frames.len() == 1)
+    }
+
     /// Returns the planned frames from `frame` (inclusive) to `end` (exclusive), or `frame` alone if it is not in the
     /// plan.
     pub fn frames_between(&self, frame: usize, end: usize) -> Vec<usize> {

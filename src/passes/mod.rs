@@ -13,7 +13,7 @@ pub(crate) mod views;
 
 pub use changed::SourceWithDeltas;
 pub use frames::FrameReaders;
-pub use gather::{BlockwiseReader, gather, gather_all};
+pub use gather::{BlockwiseReader, gather, gather_all, visible_ids};
 pub use held::FramesInMemory;
 pub use parts::BlockSlices;
 pub use sample::{

@@ -9,13 +9,16 @@ use serde::Serialize;
 use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, FrameView, hash_id};
-use crate::passes::{BatchLimits, RenderableView, RenderedSource, for_each_view_batch, select_evenly_over_frames};
+use crate::passes::{
+    BatchLimits, RenderableView, RenderedSource, for_each_view_batch, select_evenly_over_frames, visible_ids,
+};
 use crate::recipe::RefineParams;
 use crate::render::{ALL_PIXELS, GridStrides, Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::views_between::{SplitMix64, cameras_between};
 use crate::scene::views_outside::{MIN_SCORED_OUTSIDE, cameras_outside};
+use crate::source::Ids;
 
 /// Name of the cache entry of the target views that show only renders.
 pub(crate) const NAME: &str = "targets";
@@ -264,7 +267,10 @@ impl Targets {
         photograph: impl Fn(FrameView) -> Option<Result<Image>> + Sync,
     ) -> Result<Targets> {
         let make = |some: Range<usize>, values: &mut SpillWriter| {
-            let subject = [RenderedSource::all_gaussians(scene.source())];
+            let Some(first) = self.views[some.clone()].first() else { return Ok(()) };
+            let visible = visible_ids(scene.source(), first.frame)?;
+            let ids = visible.as_deref().map(Ids::List);
+            let subject = [RenderedSource { ids, ..RenderedSource::all_gaussians(scene.source()) }];
             let mut next = some.start;
             // One renderer for each view of a batch. All keep their buffers until the last batch.
             let mut renderers: Vec<Renderer> = Vec::new();

@@ -63,6 +63,7 @@ pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 pub use contribution::Contribution;
 pub use features::blend_features;
 pub use grid::{ALL_PIXELS, GridStrides, PixelGrid, SampledView};
+pub use project::MIN_LOGIT;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 

@@ -266,10 +266,13 @@ impl FrameSource for ModelFolder {
         }))
     }
 
-    /// Returns a reader of all Gaussians that computes them block by block. Frames of this format do not depend on one
-    /// another, so the reader keeps nothing between frames.
-    fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(Ok(Box::new(BlockwiseReader::new(self))))
+    /// Returns a reader of all Gaussians that computes them block by block. For several frames, it keeps the
+    /// time-independent results of the field for all Gaussians; for a single frame, it keeps nothing.
+    fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        Some(Ok(match plan.is_single_frame() {
+            true => Box::new(BlockwiseReader::new(self)),
+            false => Box::new(PreparedModel::new(self, &self.canonical, Field::prepare)),
+        }))
     }
 
     fn deformation(&self) -> Option<&dyn Deformation> {
@@ -294,11 +297,7 @@ impl Deformation for ModelFolder {
     }
 
     fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn PreparedDeformation + 'a> {
-        let ids: Vec<u32> = (0..stored.len() as u32).collect();
-        let position = &stored.gaussians.position;
-        let prepare = |ids: &[u32]| self.field.prepare_with_slopes(&position.pick(ids));
-        let prepared = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(prepare).collect();
-        Box::new(PreparedModel { model: self, stored, ids, prepared })
+        Box::new(PreparedModel::new(self, stored, Field::prepare_with_slopes))
     }
 }
 
@@ -314,7 +313,20 @@ struct PreparedModel<'a> {
     prepared: Vec<PreparedPositions>,
 }
 
-impl PreparedModel<'_> {
+impl<'a> PreparedModel<'a> {
+    /// Prepares the Gaussians with the stored parameters `stored` for the field of `model`. `prepare` computes the
+    /// time-independent results of the field from positions.
+    fn new(
+        model: &'a ModelFolder,
+        stored: &'a StoredParams,
+        prepare: fn(&Field, &AttributeValues) -> PreparedPositions,
+    ) -> Self {
+        let ids: Vec<u32> = (0..stored.len() as u32).collect();
+        let of_block = |ids: &[u32]| prepare(&model.field, &stored.gaussians.position.pick(ids));
+        let prepared = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(of_block).collect();
+        PreparedModel { model, stored, ids, prepared }
+    }
+
     /// Copies the attributes `want` of the stored parameters of the Gaussians `ids` to `raw`.
     fn copy_stored(&self, ids: &[u32], want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
@@ -350,6 +362,15 @@ impl PreparedDeformation for PreparedModel<'_> {
         let blocks = self.ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(&self.prepared);
         let blocks: Vec<Jacobian> = blocks.map(of_block).collect::<Result<_>>()?;
         Ok(Jacobian::joined(&blocks, self.ids.len()))
+    }
+}
+
+impl BlockReader for PreparedModel<'_> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
+        if !want.is_empty() {
+            self.model.states.add(self.ids.len() as u64);
+        }
+        self.state(frame, want, out)
     }
 }
 
