@@ -230,12 +230,12 @@ struct ProjectedSplats {
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
-    /// Half the width in pixels of the ellipse on which alpha is half its maximum. `half_u` · √[`Splat::cutoff`] is
-    /// half the width of the ellipse alpha ≥ 1/255, or slightly more.
-    half_u: [f64; BLOCK],
-    /// Half the height in pixels of the ellipse on which alpha is half its maximum. `half_v` · √[`Splat::cutoff`] is
-    /// half the height of the ellipse alpha ≥ 1/255, or slightly more.
-    half_v: [f64; BLOCK],
+    /// Square of half the width of the ellipse on which alpha is half its maximum, pixels². The root of
+    /// `squared_half_u` · [`Splat::cutoff`] is half the width of the ellipse alpha ≥ 1/255, or slightly more.
+    squared_half_u: [f64; BLOCK],
+    /// Square of half the height of the ellipse on which alpha is half its maximum, pixels². The root of
+    /// `squared_half_v` · [`Splat::cutoff`] is half the height of the ellipse alpha ≥ 1/255, or slightly more.
+    squared_half_v: [f64; BLOCK],
     /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
     radius: [f64; BLOCK],
     opacity: [f64; BLOCK],
@@ -262,8 +262,8 @@ impl Default for ProjectedSplats {
             falloff_x: zero,
             shear: zero,
             falloff_y: zero,
-            half_u: zero,
-            half_v: zero,
+            squared_half_u: zero,
+            squared_half_v: zero,
             radius: zero,
             opacity: zero,
             cutoff: zero,
@@ -299,11 +299,12 @@ impl ProjectedSplats {
             self.sort_depth[i] = (w0 * position[0][i] + w1 * position[1][i]) + (w2 * position[2][i] + w3);
             self.u[i] = view.focal[0] * shape.slopes[0] + view.principal[0];
             self.v[i] = view.focal[1] * shape.slopes[1] + view.principal[1];
+            let inverse_yy = 1.0 / yy;
             self.falloff_x[i] = 0.5 * LOG2_E * yy / det;
-            self.shear[i] = xy / yy;
-            self.falloff_y[i] = 0.5 * LOG2_E / yy;
-            self.half_u[i] = (2.0 * LN_2 * xx).sqrt();
-            self.half_v[i] = (2.0 * LN_2 * yy).sqrt();
+            self.shear[i] = xy * inverse_yy;
+            self.falloff_y[i] = 0.5 * LOG2_E * inverse_yy;
+            self.squared_half_u[i] = 2.0 * LN_2 * xx;
+            self.squared_half_v[i] = 2.0 * LN_2 * yy;
             self.radius[i] = (3.0 * largest.sqrt()).ceil();
             self.opacity[i] = opacity(logit[i]);
         }
@@ -318,11 +319,12 @@ impl ProjectedSplats {
         for i in 0..n.min(BLOCK) {
             let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
             let is_finite = depth.is_finite() & u.is_finite() & v.is_finite() & self.falloff_x[i].is_finite();
-            let cutoff = log2_bound(opacity / f64::from(MIN_ALPHA)) + CUTOFF_SLACK;
+            let cutoff = log2_bound(opacity * (1.0 / f64::from(MIN_ALPHA))) + CUTOFF_SLACK;
             // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255
             // can touch.
-            let root = cutoff.sqrt();
-            let (radius, half_u, half_v) = (self.radius[i], root * self.half_u[i], root * self.half_v[i]);
+            let (half_u, half_v) =
+                ((cutoff * self.squared_half_u[i]).sqrt(), (cutoff * self.squared_half_v[i]).sqrt());
+            let radius = self.radius[i];
             let (x0, x1) = image_tile_range(u, radius, half_u, image_tiles[0]);
             let (y0, y1) = image_tile_range(v, radius, half_v, image_tiles[1]);
             let (start_x, end_x) = view.grid.tile_range(0, (x0, x1), u, half_u, size[0]);
@@ -374,6 +376,8 @@ impl ProjectedSplats {
 pub(super) struct ProjectedShape {
     /// Depth from the camera, scene units.
     pub(super) depth: f64,
+    /// Reciprocal of the depth.
+    pub(super) inverse_depth: f64,
     /// Position in camera coordinates, divided by the depth: x / depth and y / depth.
     pub(super) slopes: [f64; 2],
     /// Derivatives of the image coordinates u and v with respect to the world position, pixels per scene unit: the rows
@@ -405,14 +409,15 @@ impl ProjectedShape {
         let [r0, r1, r2] = view.rotation;
         let [t0, t1, t2] = view.translation;
         let z = dot(r2, p) + t2;
-        let slopes = [(dot(r0, p) + t0) / z, (dot(r1, p) + t1) / z];
+        let inverse_depth = 1.0 / z;
+        let slopes = [(dot(r0, p) + t0) * inverse_depth, (dot(r1, p) + t1) * inverse_depth];
         let axes = rotation_matrix(q);
         let s = [
             exp(clamp_to(log_scale[0].into(), LOGARITHM_LIMIT)),
             exp(clamp_to(log_scale[1].into(), LOGARITHM_LIMIT)),
             exp(clamp_to(log_scale[2].into(), LOGARITHM_LIMIT)),
         ];
-        let (jx, jy) = (view.focal[0] / z, view.focal[1] / z);
+        let (jx, jy) = (view.focal[0] * inverse_depth, view.focal[1] * inverse_depth);
         let (kx, ky) = (clamp_to(slopes[0], view.slope_limit[0]), clamp_to(slopes[1], view.slope_limit[1]));
         let to_u = [jx * (r0[0] - kx * r2[0]), jx * (r0[1] - kx * r2[1]), jx * (r0[2] - kx * r2[2])];
         let to_v = [jy * (r1[0] - ky * r2[0]), jy * (r1[1] - ky * r2[1]), jy * (r1[2] - ky * r2[2])];
@@ -422,7 +427,7 @@ impl ProjectedShape {
             [dot(to_u, axes[0]) * s[0], dot(to_u, axes[1]) * s[1], dot(to_u, axes[2]) * s[2]],
             [dot(to_v, axes[0]) * s[0], dot(to_v, axes[1]) * s[1], dot(to_v, axes[2]) * s[2]],
         ];
-        ProjectedShape { depth: z, slopes, to_pixels: [to_u, to_v], axes, scale: s, spread }
+        ProjectedShape { depth: z, inverse_depth, slopes, to_pixels: [to_u, to_v], axes, scale: s, spread }
     }
 
     /// Returns the 2-D covariance of the footprint after dilation (adding [`DILATION`] to the diagonal).

@@ -12,7 +12,7 @@ use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GA
 use crate::metrics::psnr;
 use crate::model::{Attributes, FrameView};
 use crate::outputs::kind::OutputKind;
-use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch, select_evenly};
+use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
@@ -112,7 +112,7 @@ impl FieldPrecisionStage {
             return Ok(compressed);
         }
         let what = "half precision of the field";
-        let views = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
+        let views = select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
         if compressed.is_empty() || views.is_empty() {
             journal.leave_out(what, "there are no Gaussians or no views to compare");
             return Ok(compressed);

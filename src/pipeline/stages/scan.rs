@@ -24,7 +24,9 @@ const SECONDS_TO_PROJECT: f64 = 8e-9;
 
 /// Maximum number of frames that a partial scan reads. Such a scan measures only the bounds of positions and the
 /// fraction of views in which a Gaussian is on screen; neither decides which Gaussians stay.
-const PARTIAL_FRAMES: usize = 24;
+const PARTIAL_FRAMES: usize = 12;
+/// The same number if opacities vary with time. It limits how well life spans are known.
+const PARTIAL_FRAMES_OF_VARYING_OPACITY: usize = 24;
 
 /// Stage that gathers the statistics of all Gaussians.
 #[derive(Debug, Clone)]
@@ -39,9 +41,13 @@ pub struct ScanStage {
 
 impl ScanStage {
     /// Returns the number of frames that the scan of a sequence of `frames` frames reads. `is_deformed`: whether a
-    /// deformation field computes the frames.
-    fn frames_read(&self, frames: usize, is_deformed: bool) -> usize {
-        if self.can_be_partial && is_deformed { frames.min(PARTIAL_FRAMES) } else { frames }
+    /// deformation field computes the frames. `varying`: the attributes that vary with time.
+    fn frames_read(&self, frames: usize, is_deformed: bool, varying: Attributes) -> usize {
+        match (self.can_be_partial && is_deformed, varying.contains(Attributes::OPACITY)) {
+            (false, _) => frames,
+            (true, true) => frames.min(PARTIAL_FRAMES_OF_VARYING_OPACITY),
+            (true, false) => frames.min(PARTIAL_FRAMES),
+        }
     }
 
     /// Returns the resource estimate of the stage. Its memory holds one block of Gaussians per thread, and the
@@ -52,7 +58,7 @@ impl ScanStage {
             statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.kept_frames_bytes(&Limits::NONE, Attributes::all());
         // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);
-        let frames_read = self.frames_read(work.frames as usize, work.input.jacobian > 0) as f64;
+        let frames_read = self.frames_read(work.frames as usize, work.input.jacobian > 0, work.varying) as f64;
         ResourceEstimate {
             stage: NAME,
             reads: if work.frames == 0 { 1.0 } else { frames_read / work.frames as f64 },
@@ -75,7 +81,7 @@ impl ScanStage {
     /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
     pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
         let (source, info) = (scene.source(), scene.source().info());
-        let frames_read = self.frames_read(info.times.len(), source.deformation().is_some());
+        let frames_read = self.frames_read(info.times.len(), source.deformation().is_some(), info.varying);
         let frames = match frames_read < info.times.len() {
             true => evenly_spaced(&frames_with_views(&scene.schedule), frames_read),
             false => Vec::new(),
@@ -169,9 +175,11 @@ mod tests {
     #[test]
     fn only_frames_of_fields_are_scanned_partly() {
         let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan, can_be_partial: true };
-        assert_eq!([scan.frames_read(300, true), scan.frames_read(10, true)], [PARTIAL_FRAMES, 10]);
-        assert_eq!(scan.frames_read(300, false), 300);
-        assert_eq!(ScanStage { can_be_partial: false, ..scan }.frames_read(300, true), 300);
+        let (still, fading) = (Attributes::POSITION, Attributes::OPACITY);
+        assert_eq!([300, 10].map(|frames| scan.frames_read(frames, true, still)), [PARTIAL_FRAMES, 10]);
+        assert_eq!(scan.frames_read(300, true, fading), PARTIAL_FRAMES_OF_VARYING_OPACITY);
+        assert_eq!(scan.frames_read(300, false, fading), 300);
+        assert_eq!(ScanStage { can_be_partial: false, ..scan }.frames_read(300, true, still), 300);
     }
 
     #[test]

@@ -263,8 +263,9 @@ impl GeometryGradient {
         let [a, b] = shape.spread;
 
         // Offsets of pixels in standard deviations of the footprint: s = (x − shear·y)·per_s, t = y·per_t.
+        let inverse_yy = 1.0 / covariance.yy;
         let (shear, per_s, per_t) =
-            (covariance.xy / covariance.yy, (covariance.yy / covariance.det).sqrt(), (1.0 / covariance.yy).sqrt());
+            (covariance.xy * inverse_yy, (covariance.yy / covariance.det).sqrt(), inverse_yy.sqrt());
         let (s, t) = (per_s * x, per_t * y);
         let (ss, st, tt) = (per_s * per_s * xx, per_s * per_t * xy, per_t * per_t * yy);
         // For each axis of the Gaussian, computes ∂L/∂log scale, ∂L/∂a and ∂L/∂b.
@@ -292,7 +293,7 @@ impl GeometryGradient {
         // `to_pixels` is focal/depth · (row k − slope · depth row), with the slope clamped at the limit.
         let [row_x, row_y, row_z] = view.rotation;
         let by_slope = |k: usize, by_center: f64, by_to: [f64; 3]| {
-            let through_to = view.focal[k] / shape.depth * dot(row_z, by_to);
+            let through_to = view.focal[k] * shape.inverse_depth * dot(row_z, by_to);
             let kept = shape.slopes[k].abs() <= view.slope_limit[k];
             view.focal[k] * by_center - if kept { through_to } else { 0.0 }
         };
@@ -300,9 +301,9 @@ impl GeometryGradient {
         let by_slope_y = by_slope(1, per_t * t - shear * per_s * s, by_to_v);
         let by_size = dot(shape.to_pixels[0], by_to_u) + dot(shape.to_pixels[1], by_to_v);
         let by_depth = -by_size - shape.slopes[0] * by_slope_x - shape.slopes[1] * by_slope_y;
-        let inverse = 1.0 / shape.depth;
-        let along =
-            |axis: usize| inverse * (row_x[axis] * by_slope_x + row_y[axis] * by_slope_y + row_z[axis] * by_depth);
+        let along = |axis: usize| {
+            shape.inverse_depth * (row_x[axis] * by_slope_x + row_y[axis] * by_slope_y + row_z[axis] * by_depth)
+        };
         GeometryGradient {
             position: [along(0), along(1), along(2)],
             rotation: by_quaternion(q, torque),
