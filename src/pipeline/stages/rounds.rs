@@ -62,6 +62,9 @@ pub(crate) struct Rounds {
 const PIXELS_PER_GAUSSIAN: f64 = 0.5;
 /// Value of [`Rounds::pixels_per_gaussian`] if refinement follows, which makes up for the difference.
 const PIXELS_BEFORE_REFINEMENT: f64 = 0.35;
+/// Power of the recipe's fraction of the Gaussians that a round keeps, if refinement follows, so that there are fewer
+/// rounds. The prune steps of refinement choose again among what the rounds leave.
+const FRACTION_POWER_BEFORE_REFINEMENT: f64 = 1.4;
 /// Value of [`Rounds::fewest`] (smallest fraction of the Gaussians that the last pruning round is assumed to leave) if
 /// the user requests no number of Gaussians.
 const MIN_LEFT: f64 = 0.05;
@@ -76,6 +79,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(mut rounds) = rounds.filter(|_| planning.prunes_by_views()) {
         if planning.refine.is_some() {
             rounds.pixels_per_gaussian = PIXELS_BEFORE_REFINEMENT;
+            rounds.fraction = rounds.fraction.powf(FRACTION_POWER_BEFORE_REFINEMENT);
         }
         stages.add(Phase::Rank, rounds);
     }
