@@ -59,17 +59,22 @@ impl Bins {
             sort_by_depth(keys, spare);
         };
         let count = || {
+            // First holds, for each tile, the change of the number of splats from the previous tile.
             ends.clear();
-            ends.resize(*tiles_across * tiles[1] as usize, 0);
+            ends.resize(*tiles_across * tiles[1] as usize + 1, 0);
             for rect in &splats.rects {
                 for y in rect.y0 as usize..rect.y1 as usize {
                     let row = y * *tiles_across;
-                    ends[row + rect.x0 as usize..row + rect.x1 as usize].iter_mut().for_each(|count| *count += 1);
+                    let (start, end) = (row + rect.x0 as usize, row + rect.x1 as usize);
+                    ends[start] = ends[start].wrapping_add(1);
+                    ends[end] = ends[end].wrapping_sub(1);
                 }
             }
-            let mut total = 0;
+            ends.pop();
+            let (mut count, mut total) = (0usize, 0);
             for end in ends {
-                total += *end;
+                count = count.wrapping_add(*end);
+                total += count;
                 *end = total;
             }
         };

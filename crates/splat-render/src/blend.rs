@@ -31,6 +31,8 @@ pub(super) struct SampledPixels {
     x0: f64,
     /// Row in the image of the first pixel of the tile.
     y0: f64,
+    /// Distances between neighboring columns, and between neighboring rows, in pixels of the image.
+    strides: [f64; 2],
     /// Offset of each column of the tile from its first column, in pixels of the image.
     xs: TileLine,
     /// Offset of each row of the tile from its first row, in pixels of the image.
@@ -65,7 +67,8 @@ impl SampledPixels {
             let last = across.clamp(half * LANES + 1, (half + 1) * LANES) - 1;
             [xs[half][0], xs.as_flattened()[last]]
         });
-        SampledPixels { x0, y0, xs, ys, spans, across, down }
+        let strides = [0, 1].map(|axis| f64::from(grid.stride(axis)));
+        SampledPixels { x0, y0, strides, xs, ys, spans, across, down }
     }
 
     /// Returns a bit set of the groups (eight neighboring pixels in a row of the tile) that contain a pixel of the
@@ -349,21 +352,25 @@ impl TileFootprint {
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));
-        for (row, y) in sampled.ys.as_flattened().iter().enumerate().take(sampled.down) {
-            if !(y0..y1).contains(&(sampled.y0 + f64::from(*y))) {
-                self.levels.as_flattened_mut()[row] = EXCLUDED_LEVEL;
-                self.groups &= !((1 | 1 << SIDE) << row);
-            }
+        // Number of the `count` columns or rows of the tile that lie before the pixel `end` of the image.
+        let count_before = |end: f64, origin: f64, stride: f64, count: usize| {
+            ((end - origin) / stride).ceil().clamp(0.0, count as f64) as usize
+        };
+        let column = |end: f64| count_before(end, sampled.x0, sampled.strides[0], sampled.across);
+        let row = |end: f64| count_before(end, sampled.y0, sampled.strides[1], sampled.down);
+        let (columns, rows) = (column(x0)..column(x1), row(y0)..row(y1));
+        if columns.is_empty() || rows.is_empty() {
+            self.groups = 0;
+            return;
         }
-        let drawn = |x: &&f32| (x0..x1).contains(&(sampled.x0 + f64::from(**x)));
-        let xs = &sampled.xs.as_flattened()[..sampled.across];
-        let drawn_columns = xs.iter().find(drawn).copied().zip(xs.iter().rfind(drawn).copied());
-        match drawn_columns {
-            None => self.groups = 0,
-            Some((first, last)) if xs.first() != Some(&first) || xs.last() != Some(&last) => {
-                self.drawn_columns = Some([first, last]);
-            }
-            Some(_) => {}
+        let drawn_rows = (1u32 << rows.end) - (1 << rows.start);
+        self.groups &= drawn_rows | drawn_rows << SIDE;
+        for row in (0..rows.start).chain(rows.end..SIDE) {
+            self.levels.as_flattened_mut()[row] = EXCLUDED_LEVEL;
+        }
+        if columns != (0..sampled.across) {
+            let xs = sampled.xs.as_flattened();
+            self.drawn_columns = Some([xs[columns.start], xs[columns.end - 1]]);
         }
     }
 }
