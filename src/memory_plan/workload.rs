@@ -122,6 +122,18 @@ impl Workload {
         work.seen_by(rig, views, pairs)
     }
 
+    /// Returns the workload of an input without Gaussians that has `frames` frames and views of `pixels` pixels.
+    #[cfg(test)]
+    pub(crate) fn of_views(frames: u64, pixels: u64) -> Workload {
+        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::empty() };
+        Workload { frames, pixels, ..Workload::new(&info, MemoryProfile::default()) }
+    }
+
+    /// Returns whether the input has a single frame, so that nothing moves.
+    pub fn is_static(&self) -> bool {
+        self.frames == 1
+    }
+
     /// Returns the number of Gaussians in the largest block if the Gaussians are divided into blocks of `block` each:
     /// `block`, or the number of all Gaussians if this is smaller.
     pub fn largest_block(&self, block: u64) -> u64 {

@@ -63,7 +63,7 @@ pub fn visible_ids(source: &dyn FrameSource, frame: usize) -> Result<Option<Vec<
         return Ok(None);
     }
     let logits = gather_all(source, frame, Attributes::OPACITY)?.opacity_logit;
-    let is_visible = |(_, logit): &(usize, &f32)| !(**logit < MIN_LOGIT);
+    let is_visible = |(_, logit): &(usize, &f32)| **logit >= MIN_LOGIT;
     let ids: Vec<u32> = logits.plane(0).iter().enumerate().filter(is_visible).map(|(id, _)| id as u32).collect();
     Ok(Some(ids).filter(|ids| ids.len() as f64 <= MAX_VISIBLE_FRACTION * logits.len() as f64))
 }

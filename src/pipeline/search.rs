@@ -180,8 +180,8 @@ impl SearchStage {
         let (request, stages, template) = (run.request, run.stages, &run.template);
         let found = run.journal.run_cached_stage(NAME, ranking.order().len(), scene, key, |journal| {
             let photographs = self.photographs(scene)?;
-            let (pixels, count) = (scene.workload().pixels, scored.gaussian_count());
-            let training = self.refine.as_ref().map_or(ALL_PIXELS, |refine| refine.strides(pixels, count));
+            let (work, count) = (scene.workload(), scored.gaussian_count());
+            let training = self.refine.as_ref().map_or(ALL_PIXELS, |refine| refine.strides(&work, count));
             let strides = ViewStrides::with_whole_validation(training);
             let target_views = self.target_views.with_frames(scored.frames_needed_to_see_all);
             let targets = Targets::new(scene, target_views, strides, photographs.is_none())?;

@@ -213,19 +213,18 @@ impl RefineStage {
 
     /// Returns the strides at which the target views are stored. Those of the training views are [`RefineStage::strides`]
     /// for `first` Gaussians, the number with which refinement begins. If prune steps remove Gaussians, they are the
-    /// strides for a third of `first`, because fewer Gaussians allow larger strides. `pixels`: number of pixels of a
-    /// view.
-    pub(crate) fn stored_strides(&self, pixels: u64, first: usize) -> ViewStrides {
+    /// strides for a third of `first`, because fewer Gaussians allow larger strides. `work`: the input.
+    pub(crate) fn stored_strides(&self, work: &Workload, first: usize) -> ViewStrides {
         let fewer = if self.prunes { first / 3 } else { first };
-        ViewStrides { training: self.strides(pixels, fewer), validation: self.validation_strides(pixels) }
+        ViewStrides { training: self.strides(work, fewer), validation: self.validation_strides(work.pixels) }
     }
 
     /// Returns the strides at which the training views are stored for the input `work`, if refinement begins with `first`
     /// Gaussians. A search, which has no target, stores them at the strides for all Gaussians.
     fn stored_training_strides(&self, work: &Workload, first: f64) -> GridStrides {
         match self.target {
-            Some(_) => self.stored_strides(work.pixels, first as usize).training,
-            None => self.strides(work.pixels, work.gaussian_count() as usize),
+            Some(_) => self.stored_strides(work, first as usize).training,
+            None => self.strides(work, work.gaussian_count() as usize),
         }
     }
 
@@ -235,10 +234,10 @@ impl RefineStage {
         if self.loss.ssim > 0.0 { ALL_PIXELS } else { grid_strides(pixels, VALIDATION_PIXELS) }
     }
 
-    /// Returns the strides of the grid of pixels of training views that are rendered and compared.
-    /// `pixels`: number of pixels of a view. `survivors`: number of Gaussians left by pruning. See [`Loss::strides`].
-    pub(crate) fn strides(&self, pixels: u64, survivors: usize) -> GridStrides {
-        self.loss.strides(pixels, survivors)
+    /// Returns the strides of the grid of pixels of training views of the input `work` that are rendered and compared.
+    /// `survivors`: number of Gaussians left by pruning. See [`Loss::strides`].
+    pub(crate) fn strides(&self, work: &Workload, survivors: usize) -> GridStrides {
+        self.loss.strides(work, survivors)
     }
 
     /// Returns the number of final steps (optimization steps after the last prune step) for a model that keeps `count`
@@ -273,7 +272,7 @@ impl RefineStage {
     /// Returns the resource estimate (bytes of memory, seconds) of refinement for the input `work`. The memory holds
     /// frame states, the optimizer, and one render with its gradient.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        self.estimate_for_views(work, limits, self.target_views.view_counts(work.pixels))
+        self.estimate_for_views(work, limits, self.target_views.view_counts(work))
     }
 
     /// Estimates memory and time as [`RefineStage::resource_estimate`] does, for `own` target views from the scene's
@@ -341,7 +340,7 @@ impl RefineStage {
             };
             // With a deformation field, states and their Jacobians take twice as long to evaluate as states alone.
             let found = if work.input.jacobian > 0 { 2.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
-            let strided = work.on_grid(self.strides(work.pixels, count as usize));
+            let strided = work.on_grid(self.strides(work, count as usize));
             work.reading_seconds(count, frames as f64 * found)
                 + work.render_seconds(renders, count, RENDER_COST)
                 + strided.render_seconds(STEP_RENDERS * steps as f64, count, RENDER_COST)

@@ -208,8 +208,8 @@ impl<'a> OptimizerState<'a> {
         self.constant_optimizer = Adam::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
         // Multiples of the strides at which the target views are stored.
-        let (pixels, stored) = (self.scene.workload().pixels, self.targets.strides());
-        let wanted = loss.strides(pixels, state.len());
+        let stored = self.targets.strides();
+        let wanted = loss.strides(&self.scene.workload(), state.len());
         self.strides = [0, 1].map(|axis| {
             let multiple = NonZeroU32::new(wanted[axis].get() / stored[axis]).unwrap_or(NonZeroU32::MIN);
             stored[axis].saturating_mul(multiple)

@@ -84,7 +84,7 @@ impl RefineStage {
         let key = (self.key(), &compressed, &seen, photographs.file_fingerprints(&seen)?, &scored.protected);
         let key = scene.work.key(&key);
         journal.run_cached_stage(NAME, count, scene, key, |journal| {
-            let strides = self.strides(scene.workload().pixels, count);
+            let strides = self.strides(&scene.workload(), count);
             let targets = Targets::with_photographs(scene, self.target_views, strides, (seen, photographs))?;
             let held_back = targets.split().validation.len();
             // The notes of a refinement are about renders of the original, so they are not taken over.

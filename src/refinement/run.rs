@@ -72,7 +72,7 @@ impl RefineStage {
         let key = scene.work.key(&(self.key(), target_views, &compressed, unrefined, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.run_stage(NAME, count, scene.source(), |journal| {
-                let strides = self.stored_strides(scene.workload().pixels, count);
+                let strides = self.stored_strides(&scene.workload(), count);
                 let targets = Targets::new(scene, target_views, strides, false)?;
                 scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets);

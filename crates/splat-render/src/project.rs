@@ -322,8 +322,7 @@ impl ProjectedSplats {
             let cutoff = log2_bound(opacity * (1.0 / f64::from(MIN_ALPHA))) + CUTOFF_SLACK;
             // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255
             // can touch.
-            let (half_u, half_v) =
-                ((cutoff * self.squared_half_u[i]).sqrt(), (cutoff * self.squared_half_v[i]).sqrt());
+            let (half_u, half_v) = ((cutoff * self.squared_half_u[i]).sqrt(), (cutoff * self.squared_half_v[i]).sqrt());
             let radius = self.radius[i];
             let (x0, x1) = image_tile_range(u, radius, half_u, image_tiles[0]);
             let (y0, y1) = image_tile_range(v, radius, half_v, image_tiles[1]);

@@ -108,7 +108,7 @@ impl<'a> ArchiveRefinement<'a> {
         if scene.schedule.pair_count() == 0 {
             return Ok(None);
         }
-        let strides = refine.stored_strides(scene.workload().pixels, compressed.len());
+        let strides = refine.stored_strides(&scene.workload(), compressed.len());
         let targets = Targets::new(scene, refine.target_views, strides, has_test_views)?;
         let mut views = targets.split();
         let is_compared = |k: usize| {

@@ -89,7 +89,7 @@ impl Degree {
             let initial_count =
                 |gaussians: usize| counts.count_before_refinement(gaussians, gaussian_count).min(ranked.order().len());
             let largest = fits.iter().map(|fit| initial_count(fit.gaussians)).max().unwrap_or_default();
-            let strides = self.refine.stored_strides(scene.workload().pixels, largest);
+            let strides = self.refine.stored_strides(&scene.workload(), largest);
             let targets = Targets::new(scene, target_views, strides, false)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
