@@ -94,3 +94,80 @@ impl BlockReader for BlockwiseReader<'_> {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diagnostics::demo_scene::DemoScene;
+    use crate::model::SequenceInfo;
+    use crate::render::render;
+
+    /// Source with the Gaussians of a demo scene, of which every `nth` is invisible in all frames.
+    struct PartlyInvisible {
+        scene: DemoScene,
+        info: SequenceInfo,
+        nth: usize,
+    }
+
+    impl PartlyInvisible {
+        fn new(nth: usize, varying: Attributes) -> PartlyInvisible {
+            let scene = DemoScene::new(500, 4);
+            let info = SequenceInfo { varying, ..scene.info().clone() };
+            PartlyInvisible { scene, info, nth }
+        }
+    }
+
+    /// Reader of a [`PartlyInvisible`] source, with the ids of the Gaussians that it reads.
+    struct FadedReader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, usize);
+
+    impl FrameSource for PartlyInvisible {
+        fn info(&self) -> &SequenceInfo {
+            &self.info
+        }
+
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(FadedReader(self.scene.open(ids.clone())?, ids.iter().collect(), self.nth)))
+        }
+    }
+
+    impl BlockReader for FadedReader<'_> {
+        fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
+            self.0.read(frame, want, out)?;
+            if want.contains(Attributes::OPACITY) {
+                for (logit, id) in out.opacity_logit.plane_mut(0).iter_mut().zip(&self.1) {
+                    *logit = if id % self.2 == 0 { MIN_LOGIT - 1e-5 } else { MIN_LOGIT };
+                }
+            }
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn visible_gaussians_alone_give_the_same_image() {
+        let source = PartlyInvisible::new(3, Attributes::POSITION);
+        let ids = visible_ids(&source, 1).unwrap().unwrap();
+        assert!(ids.iter().copied().eq((0..500).filter(|id| id % 3 != 0)));
+        let camera = source.scene.rig().cameras[0].clone();
+        let visible = |state: Gaussians| {
+            let mut state = state;
+            // The least opaque Gaussians of the list would be invisible, too.
+            state
+                .opacity_logit
+                .plane_mut(0)
+                .iter_mut()
+                .for_each(|logit| *logit += 9.0 * f32::from(*logit >= MIN_LOGIT));
+            render(&state, &camera, [0.2; 3])
+        };
+        let all = visible(gather_all(&source, 2, Attributes::all()).unwrap());
+        assert!(all == visible(gather(&source, &ids, 2, Attributes::all()).unwrap()));
+        assert!(all.data.iter().any(|value| *value != 0.2));
+    }
+
+    #[test]
+    fn visible_gaussians_are_listed_only_if_it_saves_time() {
+        let few_invisible = PartlyInvisible::new(11, Attributes::POSITION);
+        assert_eq!(visible_ids(&few_invisible, 0).unwrap(), None);
+        let opacity_varies = PartlyInvisible::new(2, Attributes::OPACITY);
+        assert_eq!(visible_ids(&opacity_varies, 0).unwrap(), None);
+    }
+}

@@ -523,9 +523,9 @@ mod tests {
         };
         let default = || Recipe::preset("default").unwrap();
         let (refined, text) = counts(default(), Some(0.1), None);
-        assert_eq!(refined, [301, 301]);
+        assert_eq!(refined, [285, 285]);
         assert!(
-            text.contains("ranking leaves 301 of 1000 Gaussians (30%), refinement removes 201 of them; 100 stay"),
+            text.contains("ranking leaves 285 of 1000 Gaussians (28%), refinement removes 185 of them; 100 stay"),
             "{text}"
         );
         assert!(text.contains("\n  refine: ") && text.contains("\n  left out: merging"), "{text}");
@@ -534,7 +534,7 @@ mod tests {
         assert!(text.contains("leave 100 of 1000 Gaussians (10%); refinement removes none"), "{text}");
         // A search ranks only once, down to the smallest number of Gaussians that it may try.
         let psnr = || Some(Goal::Quality(Quality::Psnr(30.0)));
-        assert_eq!(counts(default(), None, psnr()).0, [135, 301]);
+        assert_eq!(counts(default(), None, psnr()).0, [128, 285]);
         assert_eq!(counts(default().without_refinement(), None, psnr()).0, [20, 100]);
     }
 }

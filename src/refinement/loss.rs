@@ -20,7 +20,7 @@ const SQUARED_WEIGHT: f64 = 20.0;
 const PIXELS_PER_SURVIVOR: f64 = 1.8;
 /// The same number for a static scene, whose steps need no states at several frames, so that there is time for more
 /// pixels. At 10% kept, two captured models gain 0 and 0.25 dB.
-const PIXELS_PER_SURVIVOR_IF_STATIC: f64 = 2.5;
+const PIXELS_PER_SURVIVOR_IF_STATIC: f64 = 2.65;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
 #[derive(Debug, Clone, Copy, Serialize)]

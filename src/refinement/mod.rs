@@ -60,7 +60,7 @@ pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
 /// more. Ranking alone chooses the Gaussians at the beginning; prune steps between optimization steps then remove more of
 /// them. Prune steps choose better than the ranking, because they rank optimized Gaussians and protect neighbors, but
 /// steps with more Gaussians take longer.
-const START_FACTOR: f64 = 0.95;
+const START_FACTOR: f64 = 0.9;
 /// Largest fraction of all Gaussians with which refinement begins, unless more are to stay, if there is little memory.
 const SMALL_START: f64 = 0.4;
 /// If more than this fraction of all Gaussians stay, there are fewer final steps, in proportion to the fraction removed:

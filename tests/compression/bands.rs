@@ -226,7 +226,7 @@ fn lower_degree_passes_the_loader_check_and_a_wrong_one_fails() {
 fn asked_degree_is_refined_to_its_best() {
     let workplace = Workplace::new();
     let model = write_faint_above(&workplace, 3);
-    let how = "--ratio 0.3 --set refine_steps=100 --set refine_steps_per_prune=20 --set field=exact";
+    let how = "--ratio 0.3 --set refine_steps=300 --set refine_steps_per_prune=60 --set field=exact";
     let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} --set bands=0 -o small"));
     assert!(
         summary["notes"]
