@@ -124,7 +124,7 @@ impl Workload {
 
     /// Returns the workload of an input without Gaussians that has `frames` frames and views of `pixels` pixels.
     #[cfg(test)]
-    pub(crate) fn of_views(frames: u64, pixels: u64) -> Workload {
+    pub(crate) fn with_frames_and_pixels(frames: u64, pixels: u64) -> Workload {
         let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::empty() };
         Workload { frames, pixels, ..Workload::new(&info, MemoryProfile::default()) }
     }

@@ -500,13 +500,14 @@ mod tests {
 
     #[test]
     fn large_views_are_fewer_but_never_too_few() {
-        let static_counts = |params: TargetViewParams, pixels| params.view_counts(&Workload::of_views(1, pixels));
+        let static_counts =
+            |params: TargetViewParams, pixels| params.view_counts(&Workload::with_frames_and_pixels(1, pixels));
         assert_eq!(static_counts(TargetViewParams::at_most(1000), 320 * 256), [45, 955]);
         assert_eq!(static_counts(TargetViewParams::at_most(520), 0), [45, 475]);
         assert_eq!(static_counts(TargetViewParams::at_most(1000), 1352 * 1014), [15, 115]);
         assert_eq!(static_counts(TargetViewParams::at_most(1000), 1 << 40), [11, 85]);
         assert_eq!(static_counts(TargetViewParams::at_most(40), 1 << 40), [4, 36]);
-        let moving = Workload::of_views(2, 320 * 256);
+        let moving = Workload::with_frames_and_pixels(2, 320 * 256);
         assert_eq!(TargetViewParams::at_most(1000).view_counts(&moving), [45, 755]);
         let own = TargetViewParams { between: false, ..TargetViewParams::at_most(520) };
         assert_eq!((static_counts(own, 0), own.photograph_counts(0)), ([520, 0], [400, 0]));

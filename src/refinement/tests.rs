@@ -516,14 +516,14 @@ fn the_gaussians_of_the_ranking_stay_if_prune_steps_give_a_worse_model() {
 #[test]
 fn strides_leave_enough_pixels_per_gaussian() {
     let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, true).unwrap();
-    let moving = |pixels| Workload::of_views(2, pixels);
+    let moving = |pixels| Workload::with_frames_and_pixels(2, pixels);
     let strides = |pixels, survivors| refine.strides(&moving(pixels), survivors).map(NonZeroU32::get);
     assert_eq!([strides(82_944, 30_000), strides(82_944, 12_000), strides(82_944, 6000)], [[1, 1], [2, 1], [3, 2]]);
     assert_eq!([strides(1_370_928, 80_000), strides(1_370_928, 20_000)], [[3, 3], [4, 4]]);
     assert_eq!([strides(0, 10), strides(100, 0), strides(u64::MAX, 1)], [[1, 1], [4, 4], [4, 4]]);
     // A static scene has more pixels.
-    assert_eq!(refine.strides(&Workload::of_views(1, 82_944), 12_000).map(NonZeroU32::get), [2, 1]);
-    assert_eq!(refine.strides(&Workload::of_views(1, 82_944), 20_000).map(NonZeroU32::get), [1, 1]);
+    assert_eq!(refine.strides(&Workload::with_frames_and_pixels(1, 82_944), 12_000).map(NonZeroU32::get), [2, 1]);
+    assert_eq!(refine.strides(&Workload::with_frames_and_pixels(1, 82_944), 20_000).map(NonZeroU32::get), [1, 1]);
     assert_eq!(strides(82_944, 20_000), [2, 1]);
     // Values are stored for a third of the first survivors, because prune steps will remove most.
     let stored = refine.stored_strides(&moving(82_944), 12_000);

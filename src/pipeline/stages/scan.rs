@@ -25,7 +25,8 @@ const SECONDS_TO_PROJECT: f64 = 8e-9;
 /// Maximum number of frames that a partial scan reads. Such a scan measures only the bounds of positions and the
 /// fraction of views in which a Gaussian is on screen; neither decides which Gaussians stay.
 const PARTIAL_FRAMES: usize = 12;
-/// The same number if opacities vary with time. It limits how well life spans are known.
+/// Maximum number of frames of a partial scan if opacities vary with time. Life spans are then known only as precisely as
+/// the distance of these frames.
 const PARTIAL_FRAMES_OF_VARYING_OPACITY: usize = 24;
 
 /// Stage that gathers the statistics of all Gaussians.
