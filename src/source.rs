@@ -80,9 +80,9 @@ impl ReadPlan {
         self.max_kept_frames
     }
 
-    /// Returns whether exactly one frame is planned.
-    pub fn is_single_frame(&self) -> bool {
-        self.frames.as_ref().is_some_and(|frames| frames.len() == 1)
+    /// Returns whether at most one frame is planned.
+    pub fn has_at_most_one_frame(&self) -> bool {
+        self.frames.as_ref().is_some_and(|frames| frames.len() <= 1)
     }
 
     /// Returns the planned frames from `frame` (inclusive) to `end` (exclusive), or `frame` alone if it is not in the

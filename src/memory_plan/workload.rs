@@ -125,13 +125,14 @@ impl Workload {
     /// Returns the workload of an input without Gaussians that has `frames` frames and views of `pixels` pixels.
     #[cfg(test)]
     pub(crate) fn with_frames_and_pixels(frames: u64, pixels: u64) -> Workload {
-        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::empty() };
+        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::POSITION };
         Workload { frames, pixels, ..Workload::new(&info, MemoryProfile::default()) }
     }
 
-    /// Returns whether the input has a single frame, so that nothing moves.
+    /// Returns whether nothing changes in time: there is a single frame, or no attribute varies. A stream, whose number
+    /// of frames is unknown, counts as moving.
     pub fn is_static(&self) -> bool {
-        self.frames == 1
+        self.frames == 1 || self.varying.is_empty()
     }
 
     /// Returns the number of Gaussians in the largest block if the Gaussians are divided into blocks of `block` each:

@@ -52,9 +52,9 @@ pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Attributes) -> R
 const MAX_VISIBLE_FRACTION: f64 = 0.9;
 
 /// Returns the ids of the Gaussians whose opacity lets them be visible in renders of `source`, in increasing order, if
-/// a render of these alone is faster. Renders of these Gaussians are equal to the bit to renders of all Gaussians.
-/// Returns `None` if the opacity varies in time, if pixel colors are decoded from features, or if more than
-/// [`MAX_VISIBLE_FRACTION`] of the Gaussians are visible. `frame` is any frame.
+/// renders of these alone are faster (the time to decode files is not considered). Renders of these Gaussians are equal
+/// to the bit to renders of all Gaussians. Returns `None` if the opacity varies in time, if pixel colors are decoded
+/// from features, or if more than [`MAX_VISIBLE_FRACTION`] of the Gaussians are visible. `frame` is any frame.
 ///
 /// # Errors
 /// Fails if the frame cannot be read.
@@ -69,8 +69,8 @@ pub fn visible_ids(source: &dyn FrameSource, frame: usize) -> Result<Option<Vec<
 }
 
 /// Reader of all Gaussians, for a source that decodes every frame independently of the others. It opens a new reader
-/// for each block of Gaussians at each frame, because readers of such a source that stay open would take memory and
-/// save no work.
+/// for each block of Gaussians at each frame. This suits sources whose readers would take memory and save little work if
+/// they stayed open.
 pub struct BlockwiseReader<'a> {
     source: &'a dyn FrameSource,
     ids: Vec<u32>,
@@ -117,8 +117,12 @@ mod tests {
         }
     }
 
-    /// Reader of a [`PartlyInvisible`] source, with the ids of the Gaussians that it reads.
-    struct FadedReader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, usize);
+    /// Reader of some Gaussians of a [`PartlyInvisible`] source.
+    struct FadedReader<'a> {
+        reader: Box<dyn BlockReader + 'a>,
+        ids: Vec<usize>,
+        nth: usize,
+    }
 
     impl FrameSource for PartlyInvisible {
         fn info(&self) -> &SequenceInfo {
@@ -126,16 +130,17 @@ mod tests {
         }
 
         fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-            Ok(Box::new(FadedReader(self.scene.open(ids.clone())?, ids.iter().collect(), self.nth)))
+            let reader = self.scene.open(ids.clone())?;
+            Ok(Box::new(FadedReader { reader, ids: ids.iter().collect(), nth: self.nth }))
         }
     }
 
     impl BlockReader for FadedReader<'_> {
         fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
-            self.0.read(frame, want, out)?;
+            self.reader.read(frame, want, out)?;
             if want.contains(Attributes::OPACITY) {
-                for (logit, id) in out.opacity_logit.plane_mut(0).iter_mut().zip(&self.1) {
-                    *logit = if id % self.2 == 0 { MIN_LOGIT - 1e-5 } else { MIN_LOGIT };
+                for (logit, id) in out.opacity_logit.plane_mut(0).iter_mut().zip(&self.ids) {
+                    *logit = if id % self.nth == 0 { MIN_LOGIT - 1e-5 } else { MIN_LOGIT };
                 }
             }
             Ok(())
@@ -150,7 +155,7 @@ mod tests {
         let camera = source.scene.rig().cameras[0].clone();
         let visible = |state: Gaussians| {
             let mut state = state;
-            // The least opaque Gaussians of the list would be invisible, too.
+            // At `MIN_LOGIT` the opacity is still below 1/255, so it is raised to make the listed Gaussians visible.
             state
                 .opacity_logit
                 .plane_mut(0)

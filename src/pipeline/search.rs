@@ -133,11 +133,12 @@ impl SearchStage {
         let whole = work.state_bytes(Attributes::all());
         let (reader, held) = (work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let frames = work.frames.min(128);
+        let target_views: usize = self.target_views.view_counts(work).iter().sum();
         let measured = ResourceEstimate {
             stage: NAME,
             reads: work.scattered_whole_input_reads(frames, limits),
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64)
-                + work.render_seconds(self.target_views.max_count as f64, work.gaussian_count(), RENDER_COST),
+                + work.render_seconds(target_views as f64, work.gaussian_count(), RENDER_COST),
             per_gaussian: [
                 scored_memory(limits),
                 vec![

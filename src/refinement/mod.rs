@@ -355,7 +355,7 @@ impl RefineStage {
         let views_of_steps = (work.threads + 4) * 12 * stored.pixels;
         ResourceEstimate {
             stage: NAME,
-            reads: 2.0 * work.scattered_whole_input_reads(frames, limits),
+            reads: 2.0 * work.scattered_whole_input_reads(frames, limits) + work.whole_input_reads(1, limits),
             seconds: 2.0 * work.reading_seconds(work.gaussian_count(), frames as f64)
                 + stored.render_seconds(target_views, work.gaussian_count(), RENDER_COST)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),

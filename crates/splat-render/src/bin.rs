@@ -59,7 +59,8 @@ impl Bins {
             sort_by_depth(keys, spare);
         };
         let count = || {
-            // First holds, for each tile, the change of the number of splats from the previous tile.
+            // `ends` first holds, for each tile, how many more splats it has than the previous tile (a decrease wraps
+            // around). The additional last entry takes the end of rectangles at the last tile.
             ends.clear();
             ends.resize(*tiles_across * tiles[1] as usize + 1, 0);
             for rect in &splats.rects {

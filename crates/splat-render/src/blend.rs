@@ -352,19 +352,22 @@ impl TileFootprint {
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));
-        // Number of the `count` columns or rows of the tile that lie before the pixel `end` of the image.
+        // Number of the `count` columns or rows of the tile that lie before the pixel `end` of the image. `origin` is the
+        // first pixel of the tile.
         let count_before = |end: f64, origin: f64, stride: f64, count: usize| {
             ((end - origin) / stride).ceil().clamp(0.0, count as f64) as usize
         };
-        let column = |end: f64| count_before(end, sampled.x0, sampled.strides[0], sampled.across);
-        let row = |end: f64| count_before(end, sampled.y0, sampled.strides[1], sampled.down);
-        let (columns, rows) = (column(x0)..column(x1), row(y0)..row(y1));
+        let columns_before = |end: f64| count_before(end, sampled.x0, sampled.strides[0], sampled.across);
+        let rows_before = |end: f64| count_before(end, sampled.y0, sampled.strides[1], sampled.down);
+        let columns = columns_before(x0)..columns_before(x1);
+        let rows = rows_before(y0)..rows_before(y1);
         if columns.is_empty() || rows.is_empty() {
             self.groups = 0;
             return;
         }
         let drawn_rows = (1u32 << rows.end) - (1 << rows.start);
         self.groups &= drawn_rows | drawn_rows << SIDE;
+        // A vector of several groups may hold an excluded row beside one in which the splat is drawn.
         for row in (0..rows.start).chain(rows.end..SIDE) {
             self.levels.as_flattened_mut()[row] = EXCLUDED_LEVEL;
         }

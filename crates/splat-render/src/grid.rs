@@ -85,8 +85,8 @@ impl PixelGrid {
         let first = (start * TILE_PIXELS).max((at - half).ceil());
         let last = (end * TILE_PIXELS).min(size).min((at + half).floor().max(0.0) + 1.0);
         // Number of columns or rows of the grid before a pixel, which is the quotient, rounded up, of an integer by the
-        // stride. It is computed with the reciprocal, which is faster than a division. The integer is first lowered by
-        // one half, so that rounding errors do not change the result.
+        // stride. It is computed with the reciprocal, which is faster than a division. The integer n is first lowered
+        // by one half, because ⌈(n − ½)/s⌉ = ⌈n/s⌉, and rounding errors then do not change the result.
         let reciprocal = 1.0 / f64::from(self.stride(axis));
         let count_before = |pixel: f64| (((pixel - f64::from(self.phase[axis])).max(0.0) - 0.5) * reciprocal).ceil();
         let (first, last) = (count_before(first), count_before(last));

@@ -23,7 +23,7 @@ const FOV_MARGIN: f64 = 1.3;
 /// Limit of the absolute value of a log scale and of an opacity logit. Values are clamped, so that fourth powers of
 /// scales stay finite in f64.
 pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
-/// Opacity logit below which a Gaussian is invisible: its opacity is then below 0.00392, hence less than [`MIN_ALPHA`].
+/// Opacity logit below which a Gaussian is invisible: its opacity is then at most 0.00391, which is less than 1/255.
 pub const MIN_LOGIT: f32 = -5.54;
 /// Amount by which the test alpha ≥ 1/255 is relaxed, as a difference of log₂ alpha. It is thousands of times the
 /// rounding error of the exponent of alpha, so rounding never removes a visible pixel.

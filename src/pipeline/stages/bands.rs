@@ -4,7 +4,7 @@
 //! Memory: one state of the original, two of the result (a state holds all Gaussians at one frame), and three rendered
 //! views.
 
-use super::field::{COMPARED_VIEWS, min_psnr};
+use super::field::{COMPARED_VIEWS, compared_views, min_psnr};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -14,7 +14,7 @@ use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GA
 use crate::metrics::psnr;
 use crate::model::{Attributes, FrameView, Gaussians, NO_SH_LIMIT};
 use crate::outputs::kind::OutputKind;
-use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly};
+use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
@@ -149,7 +149,7 @@ impl ShDegreeStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
-        let views = select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
+        let views = compared_views(scene);
         let stay = match scene.input.description().reason_to_keep_sh_degree {
             _ if all == 0 => Some("colors have SH degree 0"),
             None if compressed.is_empty() || views.is_empty() => Some("there are no Gaussians or no views to compare"),

@@ -64,6 +64,13 @@ impl Stage for FieldPrecisionStage {
     }
 }
 
+/// Returns the views, at most [`COMPARED_VIEWS`], by which two models are compared: several views of each frame, or one
+/// if opacities vary, because most Gaussians may then be invisible at few frames.
+pub(crate) fn compared_views(scene: &Scene) -> Vec<FrameView> {
+    let opacity_varies = scene.source().info().varying.contains(Attributes::OPACITY);
+    select_evenly(&scene.schedule, COMPARED_VIEWS, if opacity_varies { 1 } else { VIEWS_PER_FRAME })
+}
+
 impl FieldPrecisionStage {
     /// Returns the stage that chooses the precision of the deformation field. Returns `None` unless the output `kind`
     /// is a model folder and the recipe of `request` allows half precision.
@@ -112,7 +119,7 @@ impl FieldPrecisionStage {
             return Ok(compressed);
         }
         let what = "half precision of the field";
-        let views = select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
+        let views = compared_views(scene);
         if compressed.is_empty() || views.is_empty() {
             journal.leave_out(what, "there are no Gaussians or no views to compare");
             return Ok(compressed);

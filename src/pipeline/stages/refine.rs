@@ -40,7 +40,7 @@ impl Stage for RefineStage {
     fn parameters(&self) -> String {
         let RefineStage { steps, steps_per_prune, target_views, .. } = self;
         let views = target_views.max_count;
-        format!("refine: {steps} steps at the end, {steps_per_prune} before a prune step, toward {views} views")
+        format!("refine: {steps} steps at the end, {steps_per_prune} before a prune step, toward at most {views} views")
     }
 
     fn describe_shardable_work(&self, _: &Scene, _: &CountPlan) -> Vec<String> {

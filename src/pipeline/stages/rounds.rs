@@ -63,7 +63,9 @@ const PIXELS_PER_GAUSSIAN: f64 = 0.5;
 /// Value of [`Rounds::pixels_per_gaussian`] if refinement follows, which makes up for the difference.
 const PIXELS_BEFORE_REFINEMENT: f64 = 0.35;
 /// Power of the recipe's fraction of the Gaussians that a round keeps, if refinement follows, so that there are fewer
-/// rounds. The prune steps of refinement choose again among what the rounds leave.
+/// rounds. The prune steps of refinement choose again among what the rounds leave. If refinement has no prune steps, or
+/// is left out because the result is good enough, the rounds alone choose (`spinach_4`, 40% kept: 66.1 dB with both
+/// fractions).
 const FRACTION_POWER_BEFORE_REFINEMENT: f64 = 1.4;
 /// Value of [`Rounds::fewest`] (smallest fraction of the Gaussians that the last pruning round is assumed to leave) if
 /// the user requests no number of Gaussians.

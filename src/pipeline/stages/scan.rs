@@ -176,11 +176,11 @@ mod tests {
     #[test]
     fn only_frames_of_fields_are_scanned_partly() {
         let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan, can_be_partial: true };
-        let (still, fading) = (Attributes::POSITION, Attributes::OPACITY);
-        assert_eq!([300, 10].map(|frames| scan.frames_read(frames, true, still)), [PARTIAL_FRAMES, 10]);
+        let (moving, fading) = (Attributes::POSITION, Attributes::OPACITY);
+        assert_eq!([300, 10].map(|frames| scan.frames_read(frames, true, moving)), [PARTIAL_FRAMES, 10]);
         assert_eq!(scan.frames_read(300, true, fading), PARTIAL_FRAMES_OF_VARYING_OPACITY);
         assert_eq!(scan.frames_read(300, false, fading), 300);
-        assert_eq!(ScanStage { can_be_partial: false, ..scan }.frames_read(300, true, still), 300);
+        assert_eq!(ScanStage { can_be_partial: false, ..scan }.frames_read(300, true, moving), 300);
     }
 
     #[test]

@@ -2,8 +2,8 @@
 //!
 //! Input: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, frame times. Output: states of any
 //! Gaussians at any frame. Memory: the canonical Gaussians (44 + 12·(d+1)² bytes per Gaussian at SH degree d) and the
-//! tensors of the field. Each open reader takes in addition a copy of the canonical Gaussians that it reads, and
-//! [`Field::bytes_per_gaussian`] per Gaussian. [`Deformation::with_params`] takes
+//! tensors of the field. Each open reader takes in addition [`Field::bytes_per_gaussian`] per Gaussian and, if it reads
+//! only some Gaussians, a copy of their canonical values. [`Deformation::with_params`] takes
 //! [`Field::bytes_per_gaussian_with_slopes`] per Gaussian.
 
 use std::path::{Path, PathBuf};
@@ -267,9 +267,9 @@ impl FrameSource for ModelFolder {
     }
 
     /// Returns a reader of all Gaussians that computes them block by block. For several frames, it keeps the
-    /// time-independent results of the field for all Gaussians; for a single frame, it keeps nothing.
+    /// time-independent results of the field for all Gaussians; for one frame, it keeps nothing.
     fn open_all(&self, plan: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(Ok(match plan.is_single_frame() {
+        Some(Ok(match plan.has_at_most_one_frame() {
             true => Box::new(BlockwiseReader::new(self)),
             false => Box::new(PreparedModel::new(self, &self.canonical, Field::prepare)),
         }))

@@ -152,6 +152,12 @@ fn any_list_of_gaussians_reads_the_bits_of_the_whole() {
         state
     };
     let whole = read(Ids::Range(0..n), 1);
+    let mut reader = model.open_all(&ReadPlan::new([0, 1])).unwrap().unwrap();
+    let mut state = Gaussians::zeros(0, 3);
+    let before = model.reads().states;
+    [0, 1].map(|frame| reader.read(frame, Attributes::all(), &mut state).unwrap());
+    assert!(state == whole, "the reader of several frames gives other values");
+    assert_eq!(model.reads().states - before, 2 * n as u64);
     let list: Vec<u32> = (0..n as u32).rev().step_by(37).collect();
     let part = std::thread::scope(|scope| scope.spawn(|| read(Ids::List(&list), 1)).join().unwrap());
     for column in Attributes::all().iter() {
