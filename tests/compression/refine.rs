@@ -70,7 +70,7 @@ fn ssim_weight_raises_ssim_and_costs_at_most_1_db() {
     assert!(more > similarity + 0.005 && fewer > decibels - 1.0, "without and with: {found:?}");
 }
 
-/// Makes the photographs of the folder `photographs` that have an odd view number 1.5 times as bright.
+/// Makes the photographs of the folder `photographs` that have an odd view number three times as bright.
 fn brighten_every_other_view(photographs: &Path) {
     for entry in std::fs::read_dir(photographs).unwrap() {
         let path = entry.unwrap().path();
@@ -82,7 +82,7 @@ fn brighten_every_other_view(photographs: &Path) {
             let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
             let info = reader.next_frame(&mut bytes).unwrap();
             assert_eq!((info.color_type, info.bit_depth), (png::ColorType::Rgb, png::BitDepth::Eight));
-            bytes.iter_mut().for_each(|value| *value = (f32::from(*value) * 1.5).min(255.0) as u8);
+            bytes.iter_mut().for_each(|value| *value = (f32::from(*value) * 3.0).min(255.0) as u8);
             let mut encoder = png::Encoder::new(std::fs::File::create(&path).unwrap(), info.width, info.height);
             encoder.set_color(info.color_type);
             encoder.write_header().unwrap().write_image_data(&bytes).unwrap();
@@ -112,10 +112,10 @@ fn photograph_fit_is_kept_only_if_validation_photographs_gain() {
     let text = std::fs::read_to_string(workplace.path("small.gseq.recipe.toml")).unwrap();
     assert!(text.contains("toward = \"photographs\""), "{text}");
 
-    // Half of the photographs are too bright, so the fit does not raise the PSNR on the validation photographs. This takes
-    // 501 final steps, which 900 become at this ratio; after 334 steps that PSNR is 0.8 dB higher, and the fit is kept.
+    // Half of the photographs are much too bright. A fit to them lowers the PSNR on correct validation photographs by more
+    // than it raises it on bright ones, so it is not kept. (With 1.5 times the brightness, both change about equally.)
     brighten_every_other_view(&workplace.path("photographs"));
-    let plain = format!("{original} --ratio 0.5 --set refine_steps=900 --overwrite -o small.gseq");
+    let plain = format!("{original} --ratio 0.5 --set refine_steps=600 --overwrite -o small.gseq");
     let summary = workplace.summary(&format!("{plain} --toward photographs --ground-truth photographs"));
     assert!(summary["photographs"].is_null(), "{}", summary["photographs"]);
     assert!(

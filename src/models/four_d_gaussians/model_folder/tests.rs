@@ -155,7 +155,7 @@ fn any_list_of_gaussians_reads_the_bits_of_the_whole() {
     let mut reader = model.open_all(&ReadPlan::new([0, 1])).unwrap().unwrap();
     let mut state = Gaussians::zeros(0, 3);
     let before = model.reads().states;
-    [0, 1].map(|frame| reader.read(frame, Attributes::all(), &mut state).unwrap());
+    (0..2).for_each(|frame| reader.read(frame, Attributes::all(), &mut state).unwrap());
     assert!(state == whole, "the reader of several frames gives other values");
     assert_eq!(model.reads().states - before, 2 * n as u64);
     let list: Vec<u32> = (0..n as u32).rev().step_by(37).collect();
