@@ -31,8 +31,10 @@ pub(super) struct SampledPixels {
     x0: f64,
     /// Row in the image of the first pixel of the tile.
     y0: f64,
-    /// Distances between neighboring columns, and between neighboring rows, in pixels of the image.
-    strides: [f64; 2],
+    /// Pixels of the image that belong to the render.
+    grid: PixelGrid,
+    /// Number of columns of the render left of the tile, and of rows above it.
+    before: [u32; 2],
     /// Offset of each column of the tile from its first column, in pixels of the image.
     xs: TileLine,
     /// Offset of each row of the tile from its first row, in pixels of the image.
@@ -67,8 +69,8 @@ impl SampledPixels {
             let last = across.clamp(half * LANES + 1, (half + 1) * LANES) - 1;
             [xs[half][0], xs.as_flattened()[last]]
         });
-        let strides = [0, 1].map(|axis| f64::from(grid.stride(axis)));
-        SampledPixels { x0, y0, strides, xs, ys, spans, across, down }
+        let before = tile.map(|index| index * TILE);
+        SampledPixels { x0, y0, grid, before, xs, ys, spans, across, down }
     }
 
     /// Returns a bit set of the groups (eight neighboring pixels in a row of the tile) that contain a pixel of the
@@ -352,13 +354,12 @@ impl TileFootprint {
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));
-        // Number of the `count` columns or rows of the tile that lie before the pixel `end` of the image. `origin` is the
-        // first pixel of the tile.
-        let count_before = |end: f64, origin: f64, stride: f64, count: usize| {
-            ((end - origin) / stride).ceil().clamp(0.0, count as f64) as usize
+        // Number of the `count` columns (`axis` 0) or rows (`axis` 1) of the tile before the pixel `end` of the image.
+        let count_before = |axis: usize, end: f64, count: usize| {
+            (sampled.grid.count_before(axis, end) - f64::from(sampled.before[axis])).clamp(0.0, count as f64) as usize
         };
-        let columns_before = |end: f64| count_before(end, sampled.x0, sampled.strides[0], sampled.across);
-        let rows_before = |end: f64| count_before(end, sampled.y0, sampled.strides[1], sampled.down);
+        let columns_before = |end: f64| count_before(0, end, sampled.across);
+        let rows_before = |end: f64| count_before(1, end, sampled.down);
         let columns = columns_before(x0)..columns_before(x1);
         let rows = rows_before(y0)..rows_before(y1);
         if columns.is_empty() || rows.is_empty() {

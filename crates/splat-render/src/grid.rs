@@ -60,6 +60,18 @@ impl PixelGrid {
         self.phase[axis] + self.stride(axis) * index
     }
 
+    /// Returns the number of columns of the grid that lie left of column `pixel` of the image (`axis` 0), or of rows of the
+    /// grid above row `pixel` of the image (`axis` 1). `pixel` and the result are integers in f64, so that the compiler
+    /// vectorizes loops that call this function.
+    ///
+    /// The result is ⌈n/s⌉ for n = `pixel` − phase (at least 0) and the stride s. Multiplying by 1/s is faster than
+    /// dividing by s. ⌈(n − ½)/s⌉ is equal to ⌈n/s⌉, and rounding errors do not change it.
+    #[inline(always)]
+    pub(super) fn count_before(self, axis: usize, pixel: f64) -> f64 {
+        let reciprocal = 1.0 / f64::from(self.stride(axis));
+        (((pixel - f64::from(self.phase[axis])).max(0.0) - 0.5) * reciprocal).ceil()
+    }
+
     /// Returns the view of `camera` in which only the pixels of this grid are rendered.
     pub fn sampled_view(self, camera: &Camera) -> SampledView<'_> {
         SampledView { camera, grid: self }
@@ -84,12 +96,7 @@ impl PixelGrid {
         }
         let first = (start * TILE_PIXELS).max((at - half).ceil());
         let last = (end * TILE_PIXELS).min(size).min((at + half).floor().max(0.0) + 1.0);
-        // Number of columns or rows of the grid before a pixel, which is the quotient, rounded up, of an integer by the
-        // stride. It is computed with the reciprocal, which is faster than a division. The integer n is first lowered
-        // by one half, because ⌈(n − ½)/s⌉ = ⌈n/s⌉, and rounding errors then do not change the result.
-        let reciprocal = 1.0 / f64::from(self.stride(axis));
-        let count_before = |pixel: f64| (((pixel - f64::from(self.phase[axis])).max(0.0) - 0.5) * reciprocal).ceil();
-        let (first, last) = (count_before(first), count_before(last));
+        let (first, last) = (self.count_before(axis, first), self.count_before(axis, last));
         let start = (first / TILE_PIXELS).floor();
         (start, if first < last { (last / TILE_PIXELS).ceil() } else { start })
     }
