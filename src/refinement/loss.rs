@@ -20,7 +20,7 @@ const SQUARED_WEIGHT: f64 = 20.0;
 /// a run takes 2 to 15% longer.
 const PIXELS_PER_SURVIVOR: f64 = 1.8;
 /// Wanted number of rendered pixels per survivor in a static scene. There, all steps share one state, so each step takes
-/// less time. At 10% kept, two captured models gain 0 and 0.25 dB over 1.8 pixels.
+/// less time. At 10% kept, two captured models have 0 and 0.25 dB more than with 1.8 pixels.
 const PIXELS_PER_SURVIVOR_IF_STATIC: f64 = 2.65;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.

@@ -31,10 +31,8 @@ pub(super) struct SampledPixels {
     x0: f64,
     /// Row in the image of the first pixel of the tile.
     y0: f64,
-    /// Pixels of the image that belong to the render.
+    /// Which pixels of the image are rendered.
     grid: PixelGrid,
-    /// Number of columns of the render left of the tile, and of rows above it.
-    before: [u32; 2],
     /// Offset of each column of the tile from its first column, in pixels of the image.
     xs: TileLine,
     /// Offset of each row of the tile from its first row, in pixels of the image.
@@ -69,8 +67,7 @@ impl SampledPixels {
             let last = across.clamp(half * LANES + 1, (half + 1) * LANES) - 1;
             [xs[half][0], xs.as_flattened()[last]]
         });
-        let before = tile.map(|index| index * TILE);
-        SampledPixels { x0, y0, grid, before, xs, ys, spans, across, down }
+        SampledPixels { x0, y0, grid, xs, ys, spans, across, down }
     }
 
     /// Returns a bit set of the groups (eight neighboring pixels in a row of the tile) that contain a pixel of the
@@ -354,12 +351,14 @@ impl TileFootprint {
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));
-        // Number of the `count` columns (`axis` 0) or rows (`axis` 1) of the tile before the pixel `end` of the image.
-        let count_before = |axis: usize, end: f64, count: usize| {
-            (sampled.grid.count_before(axis, end) - f64::from(sampled.before[axis])).clamp(0.0, count as f64) as usize
+        // Returns how many of the `count` columns (`axis` 0) or rows (`axis` 1) of the tile lie before column or row `end`
+        // of the image. `origin` is the position in the image of the first column or row of the tile.
+        let count_before = |axis: usize, end: f64, origin: f64, count: usize| {
+            let [end, origin] = [end, origin].map(|pixel| sampled.grid.count_before(axis, pixel));
+            (end - origin).clamp(0.0, count as f64) as usize
         };
-        let columns_before = |end: f64| count_before(0, end, sampled.across);
-        let rows_before = |end: f64| count_before(1, end, sampled.down);
+        let columns_before = |end: f64| count_before(0, end, sampled.x0, sampled.across);
+        let rows_before = |end: f64| count_before(1, end, sampled.y0, sampled.down);
         let columns = columns_before(x0)..columns_before(x1);
         let rows = rows_before(y0)..rows_before(y1);
         if columns.is_empty() || rows.is_empty() {

@@ -64,8 +64,9 @@ impl PixelGrid {
     /// grid above row `pixel` of the image (`axis` 1). `pixel` and the result are integers in f64, so that the compiler
     /// vectorizes loops that call this function.
     ///
-    /// The result is ⌈n/s⌉ for n = `pixel` − phase (at least 0) and the stride s. Multiplying by 1/s is faster than
-    /// dividing by s. ⌈(n − ½)/s⌉ is equal to ⌈n/s⌉, and rounding errors do not change it.
+    /// The result is ⌈n/s⌉, where n = `pixel` − phase (0 if that is negative) and s is the stride. It is computed as
+    /// ⌈(n − ½) · (1/s)⌉: a multiplication is faster than a division, and because of the ½, rounding errors of the product
+    /// never change the result.
     #[inline(always)]
     pub(super) fn count_before(self, axis: usize, pixel: f64) -> f64 {
         let reciprocal = 1.0 / f64::from(self.stride(axis));

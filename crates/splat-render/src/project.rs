@@ -230,11 +230,11 @@ struct ProjectedSplats {
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
-    /// Square of half the width of the ellipse on which alpha is half its maximum, pixels². It is multiplied by
-    /// [`Splat::cutoff`] for the square of half the width of the ellipse alpha ≥ 1/255, or slightly more.
+    /// Square of half the width of the ellipse on which alpha is half its maximum, pixels². Multiplied by
+    /// [`Splat::cutoff`], it is the square of half the width of the ellipse alpha ≥ 1/255, or slightly more.
     squared_half_u: [f64; BLOCK],
-    /// Square of half the height of that ellipse, pixels². Multiplied by [`Splat::cutoff`], it is the square of half the
-    /// height of the ellipse alpha ≥ 1/255, or slightly more.
+    /// Square of half the height of the ellipse on which alpha is half its maximum, pixels². Multiplied by
+    /// [`Splat::cutoff`], it is the square of half the height of the ellipse alpha ≥ 1/255, or slightly more.
     squared_half_v: [f64; BLOCK],
     /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
     radius: [f64; BLOCK],

@@ -25,8 +25,8 @@ const SECONDS_TO_PROJECT: f64 = 8e-9;
 /// Maximum number of frames that a partial scan reads. Such a scan measures only the bounds of positions and the
 /// fraction of views in which a Gaussian is on screen; neither decides which Gaussians stay.
 const PARTIAL_FRAMES: usize = 12;
-/// Maximum number of frames of a partial scan if opacities vary with time. The scan then measures life spans too, each to
-/// within the time between two frames that it reads.
+/// Maximum number of frames of a partial scan if opacities vary with time. Such a scan also
+/// measures life spans. The more frames it reads, the more precisely the first and last frame of a life span are known.
 const PARTIAL_FRAMES_OF_VARYING_OPACITY: usize = 24;
 
 /// Stage that gathers the statistics of all Gaussians.
