@@ -166,8 +166,9 @@ impl Adam {
                         *mean += (1.0 - BETAS[0]) * (slope - *mean);
                         *square += (1.0 - BETAS[1]) * (slope * slope - *square);
                         let root = (*square * unbiased[1]).sqrt() + EPSILON;
-                        let next = *value - rate * reach * (*mean * unbiased[0]) / root;
-                        *value = if next.is_finite() { next } else { *value };
+                        let change = rate * reach * (*mean * unbiased[0]) / root;
+                        // Subtracts 0 instead of skipping the store: a store that depends on a condition is slow.
+                        *value -= if (*value - change).is_finite() { change } else { 0.0 };
                     }
                 },
             );

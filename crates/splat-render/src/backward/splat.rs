@@ -168,9 +168,10 @@ impl GradientBlock {
         // ∂L/∂Y_k for each SH basis function Y_k: the sum over color channels of the SH coefficient times ∂L/∂color.
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficient_count(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(color::coefficients(gaussians)).skip(1) {
-            let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
-            for i in 0..n {
-                by_value[i] = sh[0][i] * self.color[0][i] + sh[1][i] * self.color[1][i] + sh[2][i] * self.color[2][i];
+            let [red, green, blue] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
+            // Not `sh[c][i]`: the compiler would check every index and not vectorize the loop.
+            for (i, (((by, red), green), blue)) in by_value.iter_mut().zip(red).zip(green).zip(blue).enumerate() {
+                *by = red * self.color[0][i] + green * self.color[1][i] + blue * self.color[2][i];
             }
         }
         let mut parts = [[0.0f32; BLOCK]; 3];
