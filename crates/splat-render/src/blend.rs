@@ -161,7 +161,7 @@ impl BlendSink for ColorSink {
     #[inline(always)]
     fn add<V: Lanes>(&mut self, color: [V; 3], group: usize, Fragment { weight, .. }: Fragment<V>) -> [V; 3] {
         for (plane, color) in self.planes.iter_mut().zip(color) {
-            V::load(plane, group).add(color.mul(weight)).store(plane, group);
+            color.mul_add(weight, V::load(plane, group)).store(plane, group);
         }
         color
     }
@@ -217,7 +217,7 @@ impl BlendKernel {
     pub(super) fn all() -> Vec<Self> {
         let mut all = vec![BlendKernel::Portable];
         #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx2") {
+        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
             all.push(BlendKernel::Avx2);
             if splat_core::has_avx512() {
                 all.push(BlendKernel::Avx512);
@@ -258,7 +258,7 @@ impl BlendKernel {
             BlendKernel::Portable => blend::<Portable, _>(splats, pairs, sampled, sink),
             #[cfg(target_arch = "x86_64")]
             BlendKernel::Avx2 => {
-                #[target_feature(enable = "avx2")]
+                #[target_feature(enable = "avx2,fma")]
                 fn blend_avx2(
                     splats: &[Splat],
                     pairs: &[u32],
@@ -267,12 +267,12 @@ impl BlendKernel {
                 ) -> TilePlane {
                     blend::<super::lanes::Avx2, _>(splats, pairs, sampled, sink)
                 }
-                // SAFETY: only `all` makes `BlendKernel::Avx2`, after AVX2 was detected.
+                // SAFETY: only `all` makes `BlendKernel::Avx2`, after AVX2 and FMA were detected.
                 unsafe { blend_avx2(splats, pairs, sampled, sink) }
             }
             #[cfg(target_arch = "x86_64")]
             BlendKernel::Avx512 => {
-                #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
+                #[target_feature(enable = "avx2,fma,avx512f,avx512dq,avx512vl")]
                 fn blend_avx512(
                     splats: &[Splat],
                     pairs: &[u32],
@@ -317,33 +317,32 @@ struct TileFootprint {
 }
 
 impl TileFootprint {
-    /// Computes the footprint of `splat` in the tile `sampled`. `pair` is the index of the splat in the list of splats
-    /// of the tile.
+    /// Overwrites `self` with the footprint of `splat` in the tile `sampled`. `pair` is the index of the splat in the
+    /// list of splats of the tile.
     #[inline(always)]
-    fn new<V: Lanes>(splat: &Splat, pair: usize, sampled: &SampledPixels) -> Self {
+    fn fill<V: Lanes>(&mut self, splat: &Splat, pair: usize, sampled: &SampledPixels) {
         // Relative to the corner of the tile, f32 has a precision of a millionth of a pixel wherever the tile lies.
         let (u, v) = ((splat.u - sampled.x0) as f32, (splat.v - sampled.y0) as f32);
-        let mut footprint = TileFootprint { pair, v, ..TileFootprint::default() };
+        (self.pair, self.v, self.groups, self.drawn_columns) = (pair, v, 0, None);
         let (zero, falloff_x, floor) = (V::splat(0.0), V::splat(splat.falloff_x), V::splat(-splat.cutoff));
         for first in (0..SIDE / LANES).step_by(V::GROUPS) {
             let dy = V::load(&sampled.ys, first).sub(V::splat(v));
-            let middle = V::splat(u).add(V::splat(splat.shear).mul(dy));
+            let middle = V::splat(splat.shear).mul_add(dy, V::splat(u));
             let level = zero.sub(V::splat(splat.falloff_y).mul(dy.mul(dy)));
-            middle.store(&mut footprint.middles, first);
-            level.store(&mut footprint.levels, first);
+            middle.store(&mut self.middles, first);
+            level.store(&mut self.levels, first);
             // A group of pixels contains no visible one if the exponent at its point nearest to `middle` is below
-            // `floor`: f32 subtraction and multiplication are monotone, so evaluating its pixels one by one would give
+            // `floor`: f32 operations are monotone, so evaluating its pixels one by one would give
             // alpha < 1/255 for each.
             for (column, [start, end]) in sampled.spans.iter().enumerate() {
                 let gap = V::splat(*start).sub(middle).max(middle.sub(V::splat(*end))).max(zero);
-                let nearest = level.sub(falloff_x.mul(gap.mul(gap)));
-                footprint.groups |= V::bits(nearest.at_least(floor)) << (column * SIDE + first * LANES);
+                let nearest = falloff_x.neg_mul_add(gap.mul(gap), level);
+                self.groups |= V::bits(nearest.at_least(floor)) << (column * SIDE + first * LANES);
             }
         }
-        if splat.drawn_tiles != Splat::UNBOUNDED && footprint.groups != 0 {
-            footprint.exclude_tiles(splat, sampled);
+        if splat.drawn_tiles != Splat::UNBOUNDED && self.groups != 0 {
+            self.exclude_tiles(splat, sampled);
         }
-        footprint
     }
 
     /// Removes from the footprint all pixels outside the tiles in which the original CUDA rasterizer draws the splat
@@ -399,9 +398,10 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
         }
         let mut visible = 0;
         for (k, &index) in chunk_pairs.iter().enumerate() {
-            let footprint = TileFootprint::new::<V>(&splats[index as usize], chunk * LOOKAHEAD + k, sampled);
-            footprints[visible] = TileFootprint { groups: vectors(footprint.groups) & live, ..footprint };
-            visible += usize::from(footprints[visible].groups != 0);
+            let footprint = &mut footprints[visible];
+            footprint.fill::<V>(&splats[index as usize], chunk * LOOKAHEAD + k, sampled);
+            footprint.groups = vectors(footprint.groups) & live;
+            visible += usize::from(footprint.groups != 0);
         }
         for footprint in &footprints[..visible] {
             let splat = &splats[pairs[footprint.pair] as usize];
@@ -416,7 +416,7 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
                 rest &= rest - 1;
                 let row = group % SIDE;
                 let dx = xs[group / SIDE].sub(V::splat_each(&footprint.middles, row));
-                let power = V::splat_each(&footprint.levels, row).sub(falloff_x.mul(dx.mul(dx)));
+                let power = falloff_x.neg_mul_add(dx.mul(dx), V::splat_each(&footprint.levels, row));
                 let mut alpha = opacity.mul(power.exp2()).min(V::splat(MAX_ALPHA));
                 if let Some([first, last]) = footprint.drawn_columns {
                     let x = xs[group / SIDE];
@@ -437,7 +437,7 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
                     let row = group % SIDE;
                     let alpha = V::load(&alphas, group);
                     let before = V::load(&transmittance, group);
-                    let after = before.mul(V::splat(1.0).sub(alpha));
+                    let after = alpha.neg_mul_add(before, before);
                     // The transmittance of an ended pixel is negative, so the pixel stays ended.
                     let drawn = alpha.at_least(V::splat(MIN_ALPHA));
                     let blended = V::both(drawn, after.at_least(V::splat(MIN_TRANSMITTANCE)));

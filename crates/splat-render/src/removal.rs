@@ -134,8 +134,8 @@ impl BlendSink for RemovalSink<'_> {
             let own = color.mul(weight);
             let background = V::load(plane, group).sub(own);
             background.store(plane, group);
-            let change = own.sub(gain.mul(background));
-            squares = squares.add(change.mul(change));
+            let change = gain.neg_mul_add(background, own);
+            squares = change.mul_add(change, squares);
         }
         (color, squares.add_to(sum))
     }

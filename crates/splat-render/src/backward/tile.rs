@@ -97,14 +97,14 @@ impl<const SHAPE: bool> BlendSink for GradientSink<'_, SHAPE> {
             return accumulator;
         }
         let [red, green, blue] = accumulator.color;
-        let own = red.mul(by_color[0]).add(green.mul(by_color[1])).add(blue.mul(by_color[2]));
+        let own = blue.mul_add(by_color[2], green.mul_add(by_color[1], red.mul(by_color[0])));
         let rest = V::load(&self.gradients.rest, group).sub(own);
         rest.store(&mut self.gradients.rest, group);
         // p = alpha · ∂L/∂alpha = own − rest · alpha / (1 − alpha). A clamped alpha has gradient 0. The division
         // depends only on alpha, so it can start early.
         let odds = alpha.div(V::splat(1.0).sub(alpha));
         let unclamped = V::both(blended, V::splat(MAX_UNCLAMPED_ALPHA).at_least(alpha));
-        let p = own.sub(odds.mul(rest)).keep(unclamped);
+        let p = odds.neg_mul_add(rest, own).keep(unclamped);
         let (px, py) = (p.mul(offset_x), p.mul(offset_y));
         accumulator.p = p.add_to_even_odd(accumulator.p);
         accumulator.first = [px.add_to_even_odd(accumulator.first[0]), py.add_to_even_odd(accumulator.first[1])];

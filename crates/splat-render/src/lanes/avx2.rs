@@ -9,9 +9,8 @@ use super::{LANES, Lanes, Sums};
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx2(pub(super) __m256);
 
-// SAFETY of every block below: the instructions need AVX2 (most only AVX). `Avx2` is used only by
-// `super::super::blend::BlendKernel::tile` and by `super::avx512`, in functions entered after
-// `is_x86_feature_detected!("avx2")`. Loads and stores use the unaligned forms, on arrays of exactly eight f32. A
+// SAFETY of every block below: the instructions need AVX2 (most only AVX) or FMA. `Avx2` is used only by
+// `super::super::blend::BlendKernel::tile` and by `super::avx512`, in functions entered after both were detected. Loads and stores use the unaligned forms, on arrays of exactly eight f32. A
 // prefetched address comes from a reference, and a prefetch reads nothing.
 macro_rules! avx2 {
     ($e:expr) => {
@@ -61,6 +60,14 @@ impl Lanes for Avx2 {
     #[inline(always)]
     fn mul(self, other: Self) -> Self {
         Avx2(avx2!(_mm256_mul_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn mul_add(self, factor: Self, term: Self) -> Self {
+        Avx2(avx2!(_mm256_fmadd_ps(self.0, factor.0, term.0)))
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, factor: Self, term: Self) -> Self {
+        Avx2(avx2!(_mm256_fnmadd_ps(self.0, factor.0, term.0)))
     }
     #[inline(always)]
     fn div(self, other: Self) -> Self {

@@ -70,6 +70,14 @@ impl Lanes for Avx512 {
         Avx512(avx512!(_mm512_mul_ps(self.0, other.0)))
     }
     #[inline(always)]
+    fn mul_add(self, factor: Self, term: Self) -> Self {
+        Avx512(avx512!(_mm512_fmadd_ps(self.0, factor.0, term.0)))
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, factor: Self, term: Self) -> Self {
+        Avx512(avx512!(_mm512_fnmadd_ps(self.0, factor.0, term.0)))
+    }
+    #[inline(always)]
     fn div(self, other: Self) -> Self {
         Avx512(avx512!(_mm512_div_ps(self.0, other.0)))
     }

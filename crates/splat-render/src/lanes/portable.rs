@@ -53,6 +53,14 @@ impl Lanes for Portable {
         self.zip(other, |a, b| a * b)
     }
     #[inline(always)]
+    fn mul_add(self, factor: Self, term: Self) -> Self {
+        Portable(std::array::from_fn(|l| mul_add(self.0[l], factor.0[l], term.0[l])))
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, factor: Self, term: Self) -> Self {
+        Portable(self.0.map(|value| -value)).mul_add(factor, term)
+    }
+    #[inline(always)]
     fn div(self, other: Self) -> Self {
         self.zip(other, |a, b| a / b)
     }
@@ -110,6 +118,31 @@ impl Lanes for Portable {
     }
 }
 
+/// Returns `a · b + c`, rounded once, like [`f32::mul_add`], which is a slow function call on processors without fused
+/// multiply-adds.
+///
+/// The product of two f32 is exact in f64. If the sum is not, it is rounded to an odd last bit instead of to the nearest
+/// value, so that rounding it again, to f32, gives the same result as rounding the exact sum (Boldo and Melquiond,
+/// "Emulation of FMA and correctly rounded sums: proved algorithms using rounding to odd", 2008).
+#[inline(always)]
+fn mul_add(a: f32, b: f32, c: f32) -> f32 {
+    if cfg!(any(target_feature = "fma", target_arch = "aarch64")) {
+        return a.mul_add(b, c);
+    }
+    let (product, c) = (f64::from(a) * f64::from(b), f64::from(c));
+    let sum = product + c;
+    // Exact sum minus `sum` (Knuth's two-sum).
+    let added = sum - product;
+    let error = (product - (sum - added)) + (c - added);
+    let bits = sum.to_bits();
+    let odd = match (error > 0.0) == (sum > 0.0) {
+        true => bits | 1,
+        false => bits - (1 - (bits & 1)),
+    };
+    // False for a NaN, too: then the sum is not finite.
+    (if error.abs() > 0.0 { f64::from_bits(odd) } else { sum }) as f32
+}
+
 impl Sums for Portable {
     #[inline(always)]
     fn zero() -> Self {
@@ -122,5 +155,32 @@ impl Sums for Portable {
     #[inline(always)]
     fn values(self) -> [f32; LANES] {
         self.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::mul_add;
+
+    #[test]
+    fn mul_add_matches_the_standard_library() {
+        let mut state = 1u64;
+        let mut next = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as u32
+        };
+        let mut inexact = 0;
+        for round in 0..400_000 {
+            // Any bits, among them NaN and infinity, or values of similar size, whose sums cancel.
+            let mut value = || f32::from_bits(if round % 2 == 0 { next() << 1 } else { 0x3f00_0000 | next() >> 6 });
+            let (a, b, mut c) = (value(), value(), value());
+            if round % 3 == 0 {
+                c = -a * b;
+            }
+            let (found, expected) = (mul_add(a, b, c), a.mul_add(b, c));
+            assert!(found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan(), "{a} · {b} + {c}");
+            inexact += usize::from(found != a * b + c);
+        }
+        assert!(inexact > 10_000, "{inexact} results differ from unfused ones");
     }
 }
