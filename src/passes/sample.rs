@@ -89,7 +89,7 @@ pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames:
     if scan.scoring_views == 0 || left.pair_count() <= scan.scoring_views {
         return left.frame_views().collect();
     }
-    select_evenly_over_frames(&left, scan.scoring_views, frames)
+    select_evenly_over_frames(&left, scan.scoring_views, frames, VIEWS_PER_FRAME)
 }
 
 /// Returns the minimum number of evenly spaced frames such that at least 99% of the Gaussians are alive (opacity ≥
@@ -106,10 +106,15 @@ pub fn frames_needed_to_see_all(life: &[u32], frames: usize) -> usize {
 }
 
 /// Selects at most `max_views` views with [`select_evenly`], from at least `frames` frames if possible. Takes
-/// [`VIEWS_PER_FRAME`] views of each frame that it uses, or fewer (at least one) if this is necessary to use `frames`
+/// `views_per_frame` views of each frame that it uses, or fewer (at least one) if this is necessary to use `frames`
 /// frames.
-pub fn select_evenly_over_frames(schedule: &ViewSchedule, max_views: usize, frames: usize) -> Vec<FrameView> {
-    select_evenly(schedule, max_views, (max_views / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
+pub fn select_evenly_over_frames(
+    schedule: &ViewSchedule,
+    max_views: usize,
+    frames: usize,
+    views_per_frame: usize,
+) -> Vec<FrameView> {
+    select_evenly(schedule, max_views, (max_views / frames.max(1)).min(views_per_frame))
 }
 
 /// Selects at most `max_views` views, spread evenly over all frames and view numbers. Takes up to `views_per_frame`
@@ -217,12 +222,15 @@ mod tests {
             ),
             (25, 0, 1)
         );
-        let frame_count =
-            |frames_at_least: usize| frames(&select_evenly_over_frames(&schedule(300, 18), 48, frames_at_least));
+        let frame_count = |frames_at_least: usize| {
+            frames(&select_evenly_over_frames(&schedule(300, 18), 48, frames_at_least, VIEWS_PER_FRAME))
+        };
         assert_eq!([0, 1, 16, 17, 24, 25, 48, 300].map(frame_count), [16, 16, 16, 24, 24, 48, 48, 48]);
         // A Gaussian that is alive as long as 99% of the Gaussians are is alive in one of these frames.
-        let seen: Vec<usize> =
-            select_evenly_over_frames(&schedule(300, 18), 48, 25).iter().map(|view| view.frame).collect();
+        let seen: Vec<usize> = select_evenly_over_frames(&schedule(300, 18), 48, 25, VIEWS_PER_FRAME)
+            .iter()
+            .map(|view| view.frame)
+            .collect();
         assert!((0..=288).all(|birth| seen.iter().any(|frame| (birth..birth + 12).contains(frame))));
     }
 

@@ -11,7 +11,8 @@ use crate::error::Result;
 use crate::memory_plan::Workload;
 use crate::model::{Camera, FrameView, hash_id};
 use crate::passes::{
-    BatchLimits, RenderableView, RenderedSource, for_each_view_batch, select_evenly_over_frames, visible_ids,
+    BatchLimits, RenderableView, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly_over_frames,
+    visible_ids,
 };
 use crate::recipe::RefineParams;
 use crate::render::{ALL_PIXELS, GridStrides, Image, PixelGrid, Renderer, SampledView};
@@ -199,7 +200,7 @@ impl Targets {
         has_test_views: bool,
     ) -> Result<Targets> {
         let [scene_views, new_views] = params.view_counts(&scene.workload());
-        let seen = select_evenly_over_frames(&scene.schedule, scene_views, params.frames);
+        let seen = select_evenly_over_frames(&scene.schedule, scene_views, params.frames, VIEWS_PER_FRAME);
         let (cameras, views, guard_cameras) = add_new_views(scene, seen, new_views);
         let purpose = |k: usize| match guard_cameras.contains(&views[k].camera) {
             true => Purpose::Training,
