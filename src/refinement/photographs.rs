@@ -77,7 +77,7 @@ impl RefineStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let count = compressed.len();
-        if self.final_step_count(count, scored.gaussian_count()) == 0 {
+        if self.final_steps_in(scene, scored, count) == 0 {
             journal.leave_out(FIT, "no Gaussians were removed");
             return Ok(compressed);
         }

@@ -59,7 +59,7 @@ impl RefineStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let (count, target_count) = (compressed.len(), unrefined.len());
-        let steps = self.final_step_count(target_count, scored.gaussian_count());
+        let steps = self.final_steps_in(scene, scored, target_count);
         if count == 0 || scene.schedule.pair_count() == 0 {
             journal.leave_out("refinement", "there are no Gaussians or no views");
             return Ok(compressed);
@@ -98,7 +98,7 @@ impl RefineStage {
         unrefined: &[u32],
     ) -> Result<f64> {
         let target_count = unrefined.len();
-        let steps = self.final_step_count(target_count, scored.gaussian_count());
+        let steps = self.final_steps_in(scene, scored, target_count);
         let mut run = RefineRun::new(stage, self, scene, scored, targets);
         let key = run.key(compressed, target_count, target_count).extended_by(&(steps, unrefined));
         let all = || Ok(run.run_all(compressed, unrefined, steps, &mut Journal::default())?.1);
@@ -306,7 +306,7 @@ impl<'a> RefineRun<'a> {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let quality = unrefined.as_ref().map(|(_, quality)| *quality);
-        let steps = self.refine.final_step_count(compressed.len(), self.scored.gaussian_count());
+        let steps = self.refine.final_steps_in(self.scene, self.scored, compressed.len());
         let key = self.key(&compressed, compressed.len(), compressed.len());
         let (key, work) = (key.extended_by(&quality.map(|quality| quality.psnr.to_bits())), &self.scene.work);
         let (delta, trajectory, is_better, taken) =
