@@ -259,8 +259,8 @@ impl RefineStage {
         (removed_part * cost_factor * (self.steps * more) as f64 / less as f64).ceil() as usize
     }
 
-    /// Returns the result of [`RefineStage::final_step_count`] for a model that keeps `count` Gaussians of `scene`, whose
-    /// scores are `scored`.
+    /// Returns the number of final steps ([`RefineStage::final_step_count`]) for a model that keeps `count` of the
+    /// Gaussians of `scene`. `scored`: scores of all Gaussians of the scene.
     fn final_steps_in(&self, scene: &Scene, scored: &Scored, count: usize) -> usize {
         self.final_step_count(scene.source().info().varying, count, scored.gaussian_count())
     }

@@ -332,8 +332,8 @@ impl TileFootprint {
             middle.store(&mut self.middles, first);
             level.store(&mut self.levels, first);
             // A group of pixels contains no visible one if the exponent at its point nearest to `middle` is below
-            // `floor`: f32 operations are monotone, so evaluating its pixels one by one would give
-            // alpha < 1/255 for each.
+            // `floor`. The f32 operations are monotone, so evaluating its pixels one by one would give alpha < 1/255
+            // for each.
             for (column, [start, end]) in sampled.spans.iter().enumerate() {
                 let gap = V::splat(*start).sub(middle).max(middle.sub(V::splat(*end))).max(zero);
                 let nearest = falloff_x.neg_mul_add(gap.mul(gap), level);

@@ -478,14 +478,14 @@ fn is_cut_off(at: f64, half: f64, (start, end): (f64, f64), tiles: f64) -> bool 
 /// Returns an upper bound of log₂ x for normal positive x, at most 0.087 above it.
 ///
 /// For x = 2ⁿ·(1 + m) with 0 ≤ m < 1, the bits of x, read as an integer and scaled by 2⁻⁵², are 1023 + n + m. The bound
-/// uses log₂(1 + m) ≤ m + 0.0861. It ignores the last twelve bits, which contribute less than 2⁻⁴⁰.
+/// uses log₂(1 + m) ≤ m + 0.0861. The last twelve bits are left out; they contribute less than 2⁻⁴⁰.
 #[inline(always)]
 fn log2_bound(x: f64) -> f64 {
-    // Without its last twelve bits, the integer k fits into the mantissa of 2⁵² + k. AVX2 has no instruction that
-    // converts 64-bit integers to f64, so `as f64` would keep the calling loop from being vectorized.
-    const EXPONENT: f64 = (1u64 << 52) as f64;
-    let integer = f64::from_bits(EXPONENT.to_bits() | (x.to_bits() >> 12)) - EXPONENT;
-    integer * (1.0 / (1u64 << 40) as f64) - (1023.0 - 0.0861)
+    // Converts the integer k of the remaining bits to f64: as k < 2⁵², it is the mantissa of the f64 2⁵² + k. AVX2 has no
+    // instruction for this conversion, so `as f64` would keep the calling loop from being vectorized.
+    const OFFSET: f64 = (1u64 << 52) as f64;
+    let k = f64::from_bits(OFFSET.to_bits() | (x.to_bits() >> 12)) - OFFSET;
+    k * (1.0 / (1u64 << 40) as f64) - (1023.0 - 0.0861)
 }
 
 /// Returns `x` limited to −`bound` … `bound`. NaN stays NaN, so that the Gaussian counts as not finite. (`f64::clamp`

@@ -169,7 +169,8 @@ impl GradientBlock {
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficient_count(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(color::coefficients(gaussians)).skip(1) {
             let [red, green, blue] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
-            // Not `sh[c][i]`: the compiler would check every index and not vectorize the loop.
+            // The planes are iterated over with `zip`: if they were indexed, the compiler would check every index and not
+            // vectorize the loop.
             for (i, (((by, red), green), blue)) in by_value.iter_mut().zip(red).zip(green).zip(blue).enumerate() {
                 *by = red * self.color[0][i] + green * self.color[1][i] + blue * self.color[2][i];
             }

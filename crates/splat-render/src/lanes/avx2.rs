@@ -10,8 +10,9 @@ use super::{LANES, Lanes, Sums};
 pub(in super::super) struct Avx2(pub(super) __m256);
 
 // SAFETY of every block below: the instructions need AVX2 (most only AVX) or FMA. `Avx2` is used only by
-// `super::super::blend::BlendKernel::tile` and by `super::avx512`, in functions entered after both were detected. Loads and stores use the unaligned forms, on arrays of exactly eight f32. A
-// prefetched address comes from a reference, and a prefetch reads nothing.
+// `super::super::blend::BlendKernel::tile` and by `super::avx512`, in functions entered after both were detected. Loads
+// and stores use the unaligned forms, on arrays of exactly eight f32. A prefetched address comes from a reference, and
+// a prefetch reads nothing.
 macro_rules! avx2 {
     ($e:expr) => {
         // SAFETY: see the comment above the macro.

@@ -135,10 +135,7 @@ fn mul_add(a: f32, b: f32, c: f32) -> f32 {
     let added = sum - product;
     let error = (product - (sum - added)) + (c - added);
     let bits = sum.to_bits();
-    let odd = match (error > 0.0) == (sum > 0.0) {
-        true => bits | 1,
-        false => bits - (1 - (bits & 1)),
-    };
+    let odd = if (error > 0.0) == (sum > 0.0) { bits | 1 } else { (bits - 1) | 1 };
     // False for a NaN, too: then the sum is not finite.
     (if error.abs() > 0.0 { f64::from_bits(odd) } else { sum }) as f32
 }
@@ -161,18 +158,18 @@ impl Sums for Portable {
 #[cfg(test)]
 mod tests {
     use super::mul_add;
+    use splat_core::hash_id;
 
     #[test]
     fn mul_add_matches_the_standard_library() {
-        let mut state = 1u64;
-        let mut next = || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 33) as u32
-        };
+        let mut hashes = (0..).map(hash_id);
         let mut inexact = 0;
         for round in 0..400_000 {
             // Any bits, among them NaN and infinity, or values of similar size, whose sums cancel.
-            let mut value = || f32::from_bits(if round % 2 == 0 { next() << 1 } else { 0x3f00_0000 | next() >> 6 });
+            let mut value = || {
+                let bits = hashes.next().unwrap() as u32;
+                f32::from_bits(if round % 2 == 0 { bits } else { 0x3f00_0000 | bits >> 7 })
+            };
             let (a, b, mut c) = (value(), value(), value());
             if round % 3 == 0 {
                 c = -a * b;
