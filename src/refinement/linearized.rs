@@ -5,6 +5,7 @@
 use std::path::Path;
 
 use crate::cache::{Spill, SpillWriter};
+use crate::compressed_model::ParamDelta;
 use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian};
 
@@ -160,11 +161,13 @@ impl LinearizedFrames {
         self.first.as_ref()
     }
 
-    /// Reads into `to` the state of frame `k`, counted from 0 in the order in which the frames were written.
+    /// Reads into `to` what the scratch file holds of frame `k`, counted from 0 in the order in which the frames were
+    /// written: the attributes that vary with time, and the derivatives. [`LinearizedFrames::add_change`] then fills in
+    /// the other attributes, whose values are unspecified until then.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
-    pub(super) fn read(&self, k: usize, to: &mut LinearizedState) -> Result<()> {
+    pub(super) fn read_varying(&self, k: usize, to: &mut LinearizedState) -> Result<()> {
         let Some(first) = &self.first else { return Ok(()) };
         let StoredFrame { mut at, present } = self.frames[k];
         let mut read = |values: &mut [u8]| {
@@ -173,7 +176,6 @@ impl LinearizedFrames {
         };
         to.present = present.map(|count| vec![0; count]);
         read(bytemuck::cast_slice_mut(to.present.as_deref_mut().unwrap_or_default()))?;
-        let constant = Attributes::all().difference(self.varying);
         let shape = |to: &mut AttributeValues, of: &AttributeValues| {
             if to.width() != of.width() {
                 *to = AttributeValues::zeros(of.width(), 0);
@@ -181,19 +183,41 @@ impl LinearizedFrames {
             to.resize(if of.is_empty() { 0 } else { present.unwrap_or(of.len()) });
         };
         for column in Attributes::all().iter() {
-            let (of, is_constant) = (first.state.attribute_values(column), constant.contains(column));
-            let state = to.state.attribute_values_mut(column);
-            match &to.present {
-                Some(present) if is_constant => *state = of.pick(present),
-                None if is_constant => {
-                    shape(state, of);
-                    state.planes_mut().copy_from_slice(of.planes());
-                }
-                _ => shape(state, of),
-            }
+            shape(to.state.attribute_values_mut(column), first.state.attribute_values(column));
         }
         to.jacobian.derivatives_mut().iter_mut().zip(first.jacobian.derivatives()).for_each(|(to, of)| shape(to, of));
         to.stored_columns(self.varying).try_for_each(|column| read(bytemuck::cast_slice_mut(column.planes_mut())))
+    }
+
+    /// Completes `to`, a result of [`LinearizedFrames::read_varying`]: fills in the attributes that do not vary with
+    /// time, and adds to all attributes their change to first order if the stored parameters of the model change by
+    /// `change`.
+    pub(super) fn add_change(&self, change: &ParamDelta, to: &mut LinearizedState) {
+        let Some(first) = &self.first else { return };
+        let LinearizedState { present, state, jacobian } = to;
+        let picked = present.as_ref().map(|present| change.pick(present));
+        let change = &picked.as_ref().unwrap_or(change).0;
+        let mut unchanged = Attributes::all();
+        for column in Attributes::all().difference(self.varying).iter() {
+            let (from, to) = (first.state.attribute_values(column), state.attribute_values_mut(column));
+            let delta = change.attribute_values(column);
+            match present {
+                Some(present) => *to = from.pick(present),
+                // One pass over memory instead of two, because most values are SH coefficients, which do not vary.
+                None if !delta.is_empty() && jacobian.derivative(column).width() == 0 => {
+                    unchanged = unchanged.difference(column);
+                    for c in 0..from.width() {
+                        let (from, to) = (from.plane(c), to.plane_mut(c));
+                        match c < delta.width() {
+                            true => to.iter_mut().zip(from).zip(delta.plane(c)).for_each(|((to, x), by)| *to = x + by),
+                            false => to.copy_from_slice(from),
+                        }
+                    }
+                }
+                None => to.planes_mut().copy_from_slice(from.planes()),
+            }
+        }
+        jacobian.add_to(change, unchanged, state);
     }
 }
 
@@ -230,7 +254,8 @@ mod tests {
         let linearized = keeping.finish().unwrap();
         let mut read = LinearizedState::none(0);
         for (k, present) in [(4, Some(vec![3])), (0, None), (1, Some(vec![1, 4])), (2, Some(vec![])), (3, None)] {
-            linearized.read(k, &mut read).unwrap();
+            linearized.read_varying(k, &mut read).unwrap();
+            linearized.add_change(&ParamDelta::default(), &mut read);
             assert_eq!(read.present, present, "frame {k}");
             let rows = present.unwrap_or_else(|| (0..6).collect());
             let expected = &pushed[k];

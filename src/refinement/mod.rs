@@ -294,10 +294,10 @@ impl RefineStage {
     fn estimate_for_views(&self, work: &Workload, limits: &Limits, [own, between]: [usize; 2]) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let read = [("readers", work.input.reader), ("kept frames", work.kept_frames_bytes(limits, Attributes::all()))];
-        // Target views of one frame are rendered together, each by a renderer that keeps its buffers.
+        // Views of one frame are rendered together, each by a renderer that keeps its buffers.
         let together = work.threads.min(limits.views_together as u64);
-        let original = [("states", whole), ("views", together * SHARED_VIEW_BYTES_PER_GAUSSIAN)];
-        let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
+        let rendered = [("states", whole), ("views", targets::render_bytes_per_gaussian(together))];
+        let original: Vec<MemoryPart> = read.into_iter().chain(rendered).collect();
         // With a deformation field, no reader is open while steps are made. While states are evaluated again, two more
         // states and what the field computes without time are held; while views are rendered, one state per thread and
         // the renderer's buffers. A step on several threads holds the state of its frame and that of the next step.

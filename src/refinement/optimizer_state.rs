@@ -411,18 +411,15 @@ impl<'a> OptimizerState<'a> {
     /// Computes into `now` the current state of the frame with index `k` in `self.frames`, including all changes that
     /// refinement has made so far. `change`: delta of `constant_optimizer`.
     fn compute_state(&self, k: usize, change: &ParamDelta, now: &mut LinearizedState) -> Result<()> {
-        self.linearized.read(k, now)?;
+        self.linearized.read_varying(k, now)?;
         self.add_deltas(k, change, now);
         Ok(())
     }
 
-    /// Adds all changes that refinement has made so far to `now`, the stored state of the frame with index `k` in
-    /// `self.frames`. `change`: delta of `constant_optimizer`.
+    /// Adds all changes that refinement has made so far to `now`, the state of the frame with index `k` in
+    /// `self.frames` as [`LinearizedFrames::read_varying`] returns it. `change`: delta of `constant_optimizer`.
     fn add_deltas(&self, k: usize, change: &ParamDelta, now: &mut LinearizedState) {
-        match &now.present {
-            None => now.jacobian.add_to(&change.0, &mut now.state),
-            Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),
-        }
+        self.linearized.add_change(change, now);
         if !self.keyframe_optimizers.is_empty() {
             let deltas = self.keyframes_around(k).map(|(keyframe, weight)| {
                 let change = self.keyframe_optimizers[keyframe].delta();

@@ -14,7 +14,8 @@ pub(super) struct StepInput {
     pub(super) view: usize,
     /// Colors of the pixels of the target view, as integers of 16 bits ([`Targets::values`]).
     pub(super) target: Vec<u16>,
-    /// State of the frame of the target view as the scratch file holds it, without the deltas of the optimizers.
+    /// State of the frame of the target view as [`LinearizedFrames::read_varying`] returns it: without the attributes
+    /// that do not vary with time and without the deltas of the optimizers.
     pub(super) frame: LinearizedState,
 }
 
@@ -38,7 +39,7 @@ impl StepInput {
     /// Fails if a scratch file cannot be read.
     pub(super) fn read(files: StepFiles<'_>, view: usize, mut frame: LinearizedState) -> Result<StepInput> {
         let target = files.targets.values(view, files.strides)?;
-        files.linearized.read(files.frame_index(view), &mut frame)?;
+        files.linearized.read_varying(files.frame_index(view), &mut frame)?;
         Ok(StepInput { view, target, frame })
     }
 }

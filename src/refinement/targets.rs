@@ -8,14 +8,14 @@ use serde::Serialize;
 
 use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
-use crate::memory_plan::Workload;
+use crate::memory_plan::{SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
 use crate::model::{Camera, FrameView, hash_id};
 use crate::passes::{
     BatchLimits, RenderableView, RenderedSource, VIEWS_PER_FRAME, for_each_view_batch, select_evenly_over_frames,
     visible_ids,
 };
 use crate::recipe::RefineParams;
-use crate::render::{ALL_PIXELS, GridStrides, Image, PixelGrid, Renderer, SampledView};
+use crate::render::{ALL_PIXELS, GridStrides, Image, PixelGrid, Renderer, SampledView, ViewColors};
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::views_between::{SplitMix64, cameras_between};
@@ -52,6 +52,10 @@ const MIN_VIEWS: u64 = 96;
 const VALIDATION_VIEWS: usize = 32;
 /// Minimum n in "one of every n target views is a validation view": at most one view in eight is used for validation.
 const MIN_VALIDATION_EVERY: usize = 8;
+
+/// Minimum number of views of a frame for which the colors of all Gaussians are computed together, before these views
+/// are rendered.
+const COLORED_VIEWS: usize = 4;
 
 /// Number n by which validation photographs are chosen: the photographs of one in n cameras. If fewer than n cameras
 /// have photographs, one in n photographs is chosen instead.
@@ -123,6 +127,18 @@ impl TargetViewParams {
 /// [`MIN_VIEWS`], and never more than `max_views`.
 fn total_count(max_views: usize, pixels: u64) -> usize {
     (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize
+}
+
+/// Returns the number of views of a frame for which colors are computed together, if `together` views are rendered at a
+/// time.
+fn colored_views(together: usize) -> usize {
+    together.max(COLORED_VIEWS)
+}
+
+/// Returns the bytes of memory per Gaussian for the renderers and the colors of target views, if `together` views are
+/// rendered at a time.
+pub(super) fn render_bytes_per_gaussian(together: u64) -> u64 {
+    together * SHARED_VIEW_BYTES_PER_GAUSSIAN + (colored_views(together as usize) * ViewColors::BYTES) as u64
 }
 
 /// Returns `count` · `part` / `of`, rounded down.
@@ -283,28 +299,34 @@ impl Targets {
             let ids = visible.as_deref().map(Ids::List);
             let subject = [RenderedSource { ids, ..RenderedSource::all_gaussians(scene.source()) }];
             let mut next = some.start;
-            // One renderer for each view of a batch. All keep their buffers until the last batch.
-            let mut renderers: Vec<Renderer> = Vec::new();
-            for_each_view_batch(
-                subject,
-                &self.cameras,
-                &self.views[some],
-                BatchLimits::one_frame(&scene.limits),
-                |views| {
+            let limits = BatchLimits::one_frame(&scene.limits);
+            // Renderers of views that are rendered at the same time. All keep their buffers until the last batch.
+            let together = limits.views.max(1);
+            let mut renderers: Vec<Renderer> = (0..together).map(|_| Renderer::on_all_threads()).collect();
+            let mut colors = ViewColors::default();
+            let batch = BatchLimits { views: colored_views(together), ..limits };
+            for_each_view_batch(subject, &self.cameras, &self.views[some], batch, |views| {
+                // All views of a batch have the same frame.
+                if let Some(view) = views.first() {
+                    colors.fill(view.states[0], &views.iter().map(|view| view.camera).collect::<Vec<_>>());
+                }
+                for (part, views) in views.chunks(together).enumerate() {
                     let view_values = |(k, (view, renderer)): (usize, (&RenderableView<'_, 1>, &mut Renderer))| {
+                        let colors = (&colors, part * together + k);
                         let grid = self.grid(next + k, self.strides.training);
+                        let (state, sampled_view) = (view.states[0], grid.sampled_view(view.camera));
                         Ok(narrow(&match photograph(view.frame_view) {
                             Some(photograph) => sampled(&photograph?, grid),
-                            None => renderer.render(view.states[0], grid.sampled_view(view.camera), scene.background),
+                            None => renderer.render_with_colors(state, sampled_view, scene.background, colors),
                         }))
                     };
-                    renderers.resize_with(renderers.len().max(views.len()), Renderer::on_all_threads);
                     let jobs = views.par_iter().zip(renderers.par_iter_mut()).enumerate();
                     let made: Vec<Vec<u16>> = jobs.map(view_values).collect::<Result<_>>()?;
                     next += views.len();
-                    made.iter().try_for_each(|view_values| values.write(bytemuck::cast_slice(view_values)))
-                },
-            )
+                    made.iter().try_for_each(|view_values| values.write(bytemuck::cast_slice(view_values)))?;
+                }
+                Ok(())
+            })
         };
         self.values = scene.work.spill_in_shards(name, self.key, self.views.len(), &scene.scratch, make)?;
         Ok(self)

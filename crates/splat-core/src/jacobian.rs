@@ -78,13 +78,13 @@ impl Jacobian {
         whole
     }
 
-    /// Adds ∂state/∂stored · `change` to `state`. `change` is the change of the stored attributes, `state` holds the
-    /// attributes at the frame, and the added product is their change to first order.
+    /// Adds ∂state/∂stored · `change` to the attributes `attributes` of `state`. `change` is the change of the stored
+    /// attributes, `state` holds the attributes at the frame, and the added product is their change to first order.
     ///
     /// Skips attributes for which `change` is empty. If `change` has a lower SH degree than `state`, the higher SH
     /// coefficients stay unchanged.
-    pub fn add_to(&self, change: &Gaussians, state: &mut Gaussians) {
-        for which in Attributes::all().iter() {
+    pub fn add_to(&self, change: &Gaussians, attributes: Attributes, state: &mut Gaussians) {
+        for which in attributes.iter() {
             let (factors, delta, to) =
                 (self.derivative(which), change.attribute_values(which), state.attribute_values_mut(which));
             if delta.is_empty() {
@@ -168,7 +168,7 @@ mod tests {
     fn pull_back_is_the_adjoint_of_add_to() {
         let (jacobian, change) = (jacobian(11), noisy_gaussians(11, 0.754_878));
         let mut state = Gaussians::zeros(11, 1);
-        jacobian.add_to(&change, &mut state);
+        jacobian.add_to(&change, Attributes::all(), &mut state);
         let mut gradients = Gradients::new(11, Attributes::all(), 1);
         Attributes::all().iter().for_each(|which| fill_with_noise(gradients.derivatives_mut(which), 0.569_84));
         let dot = |a: &AttributeValues, b: &AttributeValues| -> f64 {
@@ -189,7 +189,7 @@ mod tests {
         let (mut change, mut state) = (Gaussians::zeros(0, 0), noisy_gaussians(5, 0.3));
         change.sh = AttributeValues::from_planes(3, vec![1.0; 15]);
         let before = state.clone();
-        jacobian(5).add_to(&change, &mut state);
+        jacobian(5).add_to(&change, Attributes::all(), &mut state);
         assert_eq!(state.sh.plane(2)[4], before.sh.plane(2)[4] + 1.0);
         assert_eq!(state.sh.plane(3), before.sh.plane(3));
         assert_eq!((state.position, state.opacity_logit), (before.position, before.opacity_logit));

@@ -106,17 +106,23 @@ impl Linear {
 
     /// Computes the outputs before ReLU for `input` `[inputs, LANES]`, and calls `take` with the index and the values
     /// of each. The outputs that fill up the last panel are included.
+    ///
+    /// Written as loops: `for_each` may be compiled as a separate function, without the instructions of `S`.
     #[inline(always)]
     fn for_each_output<S: InstructionSet>(&self, input: &[CacheLine], mut take: impl FnMut(usize, &CacheLine)) {
         let input = &input[..self.inputs];
         let wide = if S::IS_WIDE { self.bias.len() / WIDE * WIDE } else { 0 };
         for panel in (0..wide).step_by(WIDE) {
             let sums = self.panel_outputs::<S, WIDE>(input, panel);
-            sums.as_flattened().iter().enumerate().for_each(|(o, sum)| take(PANEL * panel + o, sum));
+            for (o, sum) in sums.as_flattened().iter().enumerate() {
+                take(PANEL * panel + o, sum);
+            }
         }
         for panel in wide..self.bias.len() {
             let sums = self.panel_outputs::<S, 1>(input, panel);
-            sums.as_flattened().iter().enumerate().for_each(|(o, sum)| take(PANEL * panel + o, sum));
+            for (o, sum) in sums.as_flattened().iter().enumerate() {
+                take(PANEL * panel + o, sum);
+            }
         }
     }
 
@@ -130,7 +136,10 @@ impl Linear {
         input: &[CacheLine],
         panel: usize,
     ) -> [[CacheLine; PANEL]; N] {
-        let mut sums: [_; N] = std::array::from_fn(|p| self.bias[panel + p].map(|b| CacheLine([b; LANES])));
+        let mut sums = [[CacheLine([0.0; LANES]); PANEL]; N];
+        for (sum, &bias) in sums.as_flattened_mut().iter_mut().zip(self.bias[panel..][..N].as_flattened()) {
+            *sum = CacheLine([bias; LANES]);
+        }
         let weights: [_; N] = std::array::from_fn(|p| &self.weight[(panel + p) * self.inputs..][..input.len()]);
         for (i, x) in input.iter().enumerate() {
             for (sums, weight) in sums.iter_mut().zip(&weights) {

@@ -6,11 +6,71 @@
 
 use std::ops::Range;
 
-use super::convention::BLOCK;
-use splat_core::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficient_count};
+use rayon::prelude::*;
+
+use super::convention::{BLOCK, has_visible};
+use splat_core::{Camera, Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficient_count, vectorized};
 
 /// Red, green and blue of the Gaussians of one block.
 pub(super) type Colors = [[f32; BLOCK]; 3];
+
+/// Colors of all Gaussians of one frame in several views.
+///
+/// They are computed block by block, for all views. If each render computed its own colors, it would read all SH
+/// coefficients, 192 bytes per Gaussian, from memory again, which takes longer than the arithmetic. Memory:
+/// [`ViewColors::BYTES`] per Gaussian and view.
+#[derive(Debug, Default)]
+pub struct ViewColors {
+    view_count: usize,
+    /// Red, green and blue `[blocks, views, BLOCK]`: of [`BLOCK`] consecutive Gaussians in one view after the other.
+    values: Vec<[f32; 3]>,
+}
+
+impl ViewColors {
+    /// Bytes of memory per Gaussian and view.
+    pub const BYTES: usize = size_of::<[f32; 3]>();
+
+    /// Computes the colors of `gaussians` in the views of `cameras`, on all threads of the rayon pool, in place of the
+    /// present colors.
+    pub fn fill(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
+        self.view_count = cameras.len();
+        self.values.resize(gaussians.len().div_ceil(BLOCK) * cameras.len() * BLOCK, [0.0; 3]);
+        let centers: Vec<[f64; 3]> = cameras.iter().map(|camera| camera.center().to_array()).collect();
+        let fill_block = |(k, values): (usize, &mut [[f32; 3]])| {
+            let ids = k * BLOCK..gaussians.len().min((k + 1) * BLOCK);
+            if !has_visible(gaussians, ids.clone()) {
+                return;
+            }
+            let mut colors: Colors = [[0.0; BLOCK]; 3];
+            for (&center, values) in centers.iter().zip(values.chunks_exact_mut(BLOCK)) {
+                vectorized(
+                    #[inline(always)]
+                    || evaluate(gaussians, ids.clone(), center, &mut colors),
+                );
+                for (i, value) in values.iter_mut().enumerate() {
+                    *value = [colors[0][i], colors[1][i], colors[2][i]];
+                }
+            }
+        };
+        self.values.par_chunks_mut((cameras.len() * BLOCK).max(1)).enumerate().for_each(fill_block);
+    }
+
+    /// Returns the colors in view `view` of the block of Gaussians that begins with the Gaussian `start`.
+    pub(super) fn block(&self, view: usize, start: usize) -> &[[f32; 3]] {
+        &self.values[(start / BLOCK * self.view_count + view) * BLOCK..][..BLOCK]
+    }
+}
+
+/// Source of the colors of splats.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum ColorSource<'a> {
+    /// No colors are needed: all splats are black.
+    Black,
+    /// Colors are computed from the SH coefficients of the Gaussians.
+    Coefficients,
+    /// Colors are those of a view, given by its index.
+    Computed(&'a ViewColors, usize),
+}
 
 /// Computes into `out` the colors of the Gaussians `ids` (at most [`BLOCK`]), seen from the camera position `center`:
 /// `0.5 + Σ Y_k c_k` with SH basis functions Y_k and coefficients c_k. Negative values and NaN become 0. SH

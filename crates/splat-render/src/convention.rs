@@ -1,5 +1,9 @@
 //! Constants of the original CUDA rasterizer that determine pixel values, and the block size of the projection.
 
+use std::ops::Range;
+
+use splat_core::Gaussians;
+
 /// Side of a tile in pixels. It affects pixel values, because a Gaussian is drawn in whole tiles.
 pub(super) const TILE: u32 = 16;
 /// Smallest alpha (opacity of a Gaussian at a pixel) that is blended. Smaller ones are skipped.
@@ -11,3 +15,11 @@ pub(super) const MAX_ALPHA: f32 = 0.99;
 pub(super) const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Number of Gaussians that are projected together (a block). Their arrays fit in the first-level cache.
 pub(super) const BLOCK: usize = 128;
+/// Opacity logit below which a Gaussian is invisible: its opacity is then at most 0.00391, which is less than 1/255.
+pub const MIN_LOGIT: f32 = -5.54;
+
+/// Returns whether one of the Gaussians `ids` may be visible: whether its opacity is not too low ([`MIN_LOGIT`]).
+pub(super) fn has_visible(gaussians: &Gaussians, ids: Range<usize>) -> bool {
+    // The comparison is false for NaN.
+    !gaussians.opacity_logit.plane(0)[ids].iter().all(|&logit| logit < MIN_LOGIT)
+}

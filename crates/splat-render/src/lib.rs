@@ -60,10 +60,11 @@ mod removal;
 mod renderer;
 
 pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
+pub use color::ViewColors;
 pub use contribution::Contribution;
+pub use convention::MIN_LOGIT;
 pub use features::blend_features;
 pub use grid::{ALL_PIXELS, GridStrides, PixelGrid, SampledView};
-pub use project::MIN_LOGIT;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 

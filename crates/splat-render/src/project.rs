@@ -9,8 +9,8 @@
 use std::f64::consts::{LN_2, LOG2_E};
 use std::ops::Range;
 
-use super::color::{self, Colors};
-use super::convention::{BLOCK, MIN_ALPHA, TILE};
+use super::color::{self, ColorSource, Colors};
+use super::convention::{BLOCK, MIN_ALPHA, TILE, has_visible};
 use super::grid::{PixelGrid, SampledView};
 use splat_core::exp_log::exp;
 use splat_core::{Gaussians, vectorized};
@@ -23,8 +23,6 @@ const FOV_MARGIN: f64 = 1.3;
 /// Limit of the absolute value of a log scale and of an opacity logit. Values are clamped, so that fourth powers of
 /// scales stay finite in f64.
 pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
-/// Opacity logit below which a Gaussian is invisible: its opacity is then at most 0.00391, which is less than 1/255.
-pub const MIN_LOGIT: f32 = -5.54;
 /// Amount by which the test alpha ≥ 1/255 is relaxed, as a difference of log₂ alpha. It is thousands of times the
 /// rounding error of the exponent of alpha, so rounding never removes a visible pixel.
 const CUTOFF_SLACK: f64 = 1e-3;
@@ -174,30 +172,41 @@ impl Splats {
     }
 }
 
-/// Projects the Gaussians with the indices `ids` and appends the splats of the visible ones to `out`. `colored` states
-/// whether to compute the colors of the splats; without it, they are black.
+/// Projects the Gaussians with the indices `ids` and appends the splats of the visible ones, with colors from `colors`,
+/// to `out`.
 ///
 /// A Gaussian with a position, rotation, scale or opacity that is not finite is not visible.
-pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
+pub(super) fn project(
+    gaussians: &Gaussians,
+    ids: Range<usize>,
+    view: &CameraTerms,
+    colors: ColorSource<'_>,
+    out: &mut Splats,
+) {
     vectorized(
         #[inline(always)]
-        || project_blocks(gaussians, ids, view, colored, out),
+        || project_blocks(gaussians, ids, view, colors, out),
     );
 }
 
 /// Projects Gaussians like [`project`], in blocks of [`BLOCK`] Gaussians.
 #[inline(always)]
-fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
+fn project_blocks(
+    gaussians: &Gaussians,
+    ids: Range<usize>,
+    view: &CameraTerms,
+    colors: ColorSource<'_>,
+    out: &mut Splats,
+) {
     // Reserves memory for all Gaussians at once, because growing vectors would copy splats. Reserved memory that is
     // never written takes no physical memory.
     out.splats.reserve_exact(ids.len());
     out.rects.reserve_exact(ids.len());
     let mut footprints = ProjectedSplats::default();
-    let mut colors: Colors = [[0.0; BLOCK]; 3];
+    let mut evaluated: Colors = [[0.0; BLOCK]; 3];
     for start in ids.clone().step_by(BLOCK) {
         let block = start..(start + BLOCK).min(ids.end);
-        let logits = &gaussians.opacity_logit.plane(0)[block.clone()];
-        if logits.iter().all(|&logit| logit < MIN_LOGIT) {
+        if !has_visible(gaussians, block.clone()) {
             continue;
         }
         let before = out.splats.len();
@@ -209,12 +218,20 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, 
                 out.rects.push(rect);
             }
         }
-        if colored && out.splats.len() > before {
-            color::evaluate(gaussians, block, view.center, &mut colors);
-            for splat in &mut out.splats[before..] {
-                let i = splat.id as usize - start;
-                splat.color = [colors[0][i], colors[1][i], colors[2][i]];
+        let splats = &mut out.splats[before..];
+        match colors {
+            ColorSource::Coefficients if !splats.is_empty() => {
+                color::evaluate(gaussians, block, view.center, &mut evaluated);
+                for splat in splats {
+                    let i = splat.id as usize - start;
+                    splat.color = [evaluated[0][i], evaluated[1][i], evaluated[2][i]];
+                }
             }
+            ColorSource::Computed(colors, view) => {
+                let colors = colors.block(view, start);
+                splats.iter_mut().for_each(|splat| splat.color = colors[splat.id as usize - start]);
+            }
+            ColorSource::Black | ColorSource::Coefficients => {}
         }
     }
 }

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::backward::sums::ImageGradientSums;
 use super::bin::{Bins, STRIP_PAIRS};
 use super::blend::{BlendKernel, ColorSink, SampledPixels, TilePlane, Weight, WeightSink};
+use super::color::{ColorSource, ViewColors};
 use super::contribution::Contribution;
 use super::convention::{BLOCK, TILE};
 use super::grid::{PixelGrid, SampledView};
@@ -150,7 +151,24 @@ impl Renderer {
         background: [f32; 3],
     ) -> Image {
         let view = CameraTerms::new(view.into());
-        self.prepare(gaussians, &view, true);
+        self.prepare(gaussians, &view, ColorSource::Coefficients);
+        self.render_prepared(&view, background)
+    }
+
+    /// Renders `gaussians` like [`Renderer::render`], with the same result. The colors of the Gaussians are those that
+    /// [`ViewColors::fill`] has computed for `gaussians` in the view with the index `colors.1`, which must be `view`.
+    ///
+    /// # Panics
+    /// May panic if the colors belong to other Gaussians, or if there is no view with this index.
+    pub fn render_with_colors<'a>(
+        &mut self,
+        gaussians: &Gaussians,
+        view: impl Into<SampledView<'a>>,
+        background: [f32; 3],
+        colors: (&ViewColors, usize),
+    ) -> Image {
+        let view = CameraTerms::new(view.into());
+        self.prepare(gaussians, &view, ColorSource::Computed(colors.0, colors.1));
         self.render_prepared(&view, background)
     }
 
@@ -215,7 +233,7 @@ impl Renderer {
     ) {
         assert_eq!(seen.len(), gaussians.len(), "expected as many contributions as Gaussians");
         let view = CameraTerms::new(PixelGrid::centered([stride; 2]).sampled_view(camera));
-        self.prepare(gaussians, &view, false);
+        self.prepare(gaussians, &view, ColorSource::Black);
         let task_count = self.task_count();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
@@ -246,7 +264,7 @@ impl Renderer {
     ) {
         assert_eq!(errors.len(), gaussians.len(), "expected as many removal errors as Gaussians");
         let view = CameraTerms::new(view.into());
-        self.prepare(gaussians, &view, true);
+        self.prepare(gaussians, &view, ColorSource::Coefficients);
         let mut sums = Vec::new();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats) = (&self.bins, &self.splats.splats);
@@ -265,9 +283,9 @@ impl Renderer {
         }
     }
 
-    /// Projects the Gaussians to splats, which this renderer keeps for later calls, and sorts the splats by depth.
-    /// `colored` states whether to compute the colors of the splats, too.
-    pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colored: bool) {
+    /// Projects the Gaussians to splats with colors from `colors`. This renderer keeps the splats for later calls, and
+    /// sorts them by depth.
+    pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colors: ColorSource<'_>) {
         let (count, span) = (gaussians.len(), self.span_len(gaussians.len()));
         self.splats.clear();
         if self.task_count() > 1 {
@@ -276,13 +294,13 @@ impl Renderer {
                 .with_max_len(1)
                 .map(|k| {
                     let mut splats = Splats::default();
-                    project(gaussians, k * span..((k + 1) * span).min(count), view, colored, &mut splats);
+                    project(gaussians, k * span..((k + 1) * span).min(count), view, colors, &mut splats);
                     splats
                 })
                 .collect();
             spans.into_iter().for_each(|span| self.splats.append(span));
         } else {
-            project(gaussians, 0..count, view, colored, &mut self.splats);
+            project(gaussians, 0..count, view, colors, &mut self.splats);
         }
         self.bins.begin(&self.splats, view.tiles, self.task_count() > 1);
     }
@@ -362,7 +380,7 @@ mod tests {
     use glam::{DMat3, DVec3};
 
     use super::*;
-    use splat_core::{Attributes, Gradients};
+    use splat_core::{AttributeValues, Attributes, Gradients};
 
     /// Returns 3000 Gaussians of many sizes, and a camera that looks at them. Width and height of the image are not
     /// multiples of the tile side.
@@ -413,6 +431,27 @@ mod tests {
     }
 
     #[test]
+    fn colors_computed_for_several_views_give_the_same_images() {
+        let (mut scene, camera) = scene();
+        let coefficients = (0..12 * scene.len()).map(|k| (k as f32 * 0.618_034).fract() - 0.3);
+        scene.sh = AttributeValues::from_planes(12, coefficients.collect());
+        // The first block has no visible Gaussian.
+        scene.opacity_logit.plane_mut(0)[..200].fill(-9.0);
+        let cameras = [-0.4, 0.0, 0.3].map(|x| Camera { translation: DVec3::new(x, 0.1, 0.0), ..camera.clone() });
+        let (mut renderer, mut colors) = (Renderer::new(), ViewColors::default());
+        let mut means = Vec::new();
+        for cameras in [&cameras[..], &cameras[1..2], &cameras[..2]] {
+            colors.fill(&scene, &cameras.iter().collect::<Vec<_>>());
+            for (k, camera) in cameras.iter().enumerate() {
+                let expected = renderer.render(&scene, camera, [0.3; 3]);
+                assert!(renderer.render_with_colors(&scene, camera, [0.3; 3], (&colors, k)) == expected, "view {k}");
+                means.push(expected.data.iter().sum::<f32>());
+            }
+        }
+        assert!(means[0] != means[1] && means[1] == means[3], "the views should differ: {means:?}");
+    }
+
+    #[test]
     fn results_do_not_depend_on_the_number_of_threads() {
         let expected = all_results(Renderer::new());
         for threads in [1, 2, 7] {
@@ -426,7 +465,7 @@ mod tests {
         let whole = all_results(Renderer::new());
         let (scene, camera) = scene();
         let mut renderer = Renderer::new();
-        renderer.prepare(&scene, &CameraTerms::new((&camera).into()), true);
+        renderer.prepare(&scene, &CameraTerms::new((&camera).into()), ColorSource::Coefficients);
         let tiles = renderer.bins.next_strip(&renderer.splats, usize::MAX).unwrap();
         let pairs = renderer.bins.pairs(0..7 * 5).len();
         assert_eq!(tiles, 0..7 * 5);

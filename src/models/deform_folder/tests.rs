@@ -333,7 +333,7 @@ fn jacobian_agrees_with_finite_differences() {
                 *change.attribute_values_mut(column) = AttributeValues::zeros(column.width(1), COUNT);
                 change.attribute_values_mut(column).plane_mut(j).fill(1.0);
                 let mut found = Gaussians::zeros(COUNT, 1);
-                jacobian.add_to(&change, &mut found);
+                jacobian.add_to(&change, Attributes::all(), &mut found);
                 for i in 0..column.width(1) {
                     let planes =
                         above.attribute_values(column).plane(i).iter().zip(below.attribute_values(column).plane(i));

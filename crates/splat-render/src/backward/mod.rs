@@ -22,6 +22,7 @@ use rayon::prelude::*;
 
 use super::bin::STRIP_PAIRS;
 use super::blend::SampledPixels;
+use super::color::ColorSource;
 use super::grid::SampledView;
 use super::project::CameraTerms;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs, for_each_part};
@@ -68,7 +69,7 @@ impl Renderer {
             "expected gradients of at most the SH degree of the Gaussians"
         );
         let view = CameraTerms::new(view.into());
-        self.prepare(gaussians, &view, true);
+        self.prepare(gaussians, &view, ColorSource::Coefficients);
         let image = self.render_prepared(&view, background);
         let (value, pixel_gradient) = loss(&image);
         assert_eq!(
