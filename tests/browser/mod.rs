@@ -16,8 +16,8 @@ use tempfile::TempDir;
 
 const NAMES: [&str; 5] =
     ["chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
-/// Maximum time to wait for an answer of the browser.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// Maximum time to wait for an answer of the browser, which computes WebGL on the processor if there is no graphics card.
+const PATIENCE: Duration = Duration::from_secs(240);
 
 /// Returns the browser to use: `SPLATSIEVE_BROWSER`, else an installed one. Panics if there is none.
 pub(crate) fn installed() -> PathBuf {
