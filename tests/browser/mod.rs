@@ -16,7 +16,7 @@ use tempfile::TempDir;
 
 const NAMES: [&str; 5] =
     ["chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
-/// Maximum time to wait for an answer of the browser, which computes WebGL on the processor if there is no graphics card.
+/// Maximum time to wait for an answer of the browser. Without a graphics card, the processor computes WebGL.
 const PATIENCE: Duration = Duration::from_secs(240);
 
 /// Returns the browser to use: `SPLATSIEVE_BROWSER`, else an installed one. Panics if there is none.
