@@ -189,15 +189,15 @@ impl LinearizedFrames {
         to.stored_columns(self.varying).try_for_each(|column| read(bytemuck::cast_slice_mut(column.planes_mut())))
     }
 
-    /// Completes `to`, a result of [`LinearizedFrames::read_varying`]: fills in the attributes that do not vary with
-    /// time, and adds to all attributes their change to first order if the stored parameters of the model change by
-    /// `change`.
+    /// Completes `to`, a result of [`LinearizedFrames::read_varying`] that was not completed before: fills in the
+    /// attributes that do not vary with time, and adds to all attributes their change to first order if the stored
+    /// parameters of the model change by `change`.
     pub(super) fn add_change(&self, change: &ParamDelta, to: &mut LinearizedState) {
         let Some(first) = &self.first else { return };
         let LinearizedState { present, state, jacobian } = to;
         let picked = present.as_ref().map(|present| change.pick(present));
         let change = &picked.as_ref().unwrap_or(change).0;
-        let mut unchanged = Attributes::all();
+        let mut remaining = Attributes::all();
         for column in Attributes::all().difference(self.varying).iter() {
             let (from, to) = (first.state.attribute_values(column), state.attribute_values_mut(column));
             let delta = change.attribute_values(column);
@@ -205,7 +205,7 @@ impl LinearizedFrames {
                 Some(present) => *to = from.pick(present),
                 // One pass over memory instead of two, because most values are SH coefficients, which do not vary.
                 None if !delta.is_empty() && jacobian.derivative(column).width() == 0 => {
-                    unchanged = unchanged.difference(column);
+                    remaining = remaining.difference(column);
                     for c in 0..from.width() {
                         let (from, to) = (from.plane(c), to.plane_mut(c));
                         match c < delta.width() {
@@ -217,7 +217,7 @@ impl LinearizedFrames {
                 None => to.planes_mut().copy_from_slice(from.planes()),
             }
         }
-        jacobian.add_to(change, unchanged, state);
+        jacobian.add_to(change, remaining, state);
     }
 }
 
@@ -253,9 +253,11 @@ mod tests {
         pushed.iter_mut().for_each(|linearized_state| keeping.push(linearized_state).unwrap());
         let linearized = keeping.finish().unwrap();
         let mut read = LinearizedState::none(0);
+        let change =
+            ParamDelta(Gaussians { log_scale: AttributeValues::from_planes(3, vec![0.5; 18]), ..Gaussians::default() });
         for (k, present) in [(4, Some(vec![3])), (0, None), (1, Some(vec![1, 4])), (2, Some(vec![])), (3, None)] {
             linearized.read_varying(k, &mut read).unwrap();
-            linearized.add_change(&ParamDelta::default(), &mut read);
+            linearized.add_change(&change, &mut read);
             assert_eq!(read.present, present, "frame {k}");
             let rows = present.unwrap_or_else(|| (0..6).collect());
             let expected = &pushed[k];
@@ -263,7 +265,9 @@ mod tests {
             assert_eq!(read.state.opacity_logit, expected.state.opacity_logit.pick(&rows));
             assert_eq!(read.jacobian, expected.jacobian.pick(&rows));
             // Attributes that do not vary with time come from the first frame.
-            assert_eq!(read.state.log_scale, pushed[0].state.log_scale.pick(&rows));
+            let mut log_scale = pushed[0].state.log_scale.pick(&rows);
+            log_scale.planes_mut().iter_mut().for_each(|x| *x += 0.5);
+            assert_eq!(read.state.log_scale, log_scale);
         }
         let stored_columns = [6, 2, 0, 6, 1].into_iter().map(|rows| 4 * rows * (3 + 1 + 1)).sum::<u64>() + 4 * (2 + 1);
         assert_eq!(linearized.frames[4].at + 4 + 4 * 5, stored_columns);

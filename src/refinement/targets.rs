@@ -53,8 +53,8 @@ const VALIDATION_VIEWS: usize = 32;
 /// Minimum n in "one of every n target views is a validation view": at most one view in eight is used for validation.
 const MIN_VALIDATION_EVERY: usize = 8;
 
-/// Minimum number of views of a frame for which the colors of all Gaussians are computed together, before these views
-/// are rendered.
+/// Number of views of a frame for which the colors of all Gaussians are computed together, before these views are
+/// rendered. It is more if more views are rendered at a time.
 const COLORED_VIEWS: usize = 4;
 
 /// Number n by which validation photographs are chosen: the photographs of one in n cameras. If fewer than n cameras
@@ -132,7 +132,7 @@ fn total_count(max_views: usize, pixels: u64) -> usize {
 /// Returns the number of views of a frame for which colors are computed together, if `together` views are rendered at a
 /// time.
 fn colored_views(together: usize) -> usize {
-    together.max(COLORED_VIEWS)
+    COLORED_VIEWS.next_multiple_of(together.max(1))
 }
 
 /// Returns the bytes of memory per Gaussian for the renderers and the colors of target views, if `together` views are

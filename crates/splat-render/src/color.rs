@@ -17,8 +17,8 @@ pub(super) type Colors = [[f32; BLOCK]; 3];
 /// Colors of all Gaussians of one frame in several views.
 ///
 /// They are computed block by block, for all views. If each render computed its own colors, it would read all SH
-/// coefficients, 192 bytes per Gaussian, from memory again, which takes longer than the arithmetic. Memory:
-/// [`ViewColors::BYTES`] per Gaussian and view.
+/// coefficients (192 bytes per Gaussian with degree 3) from memory again, which takes longer than the arithmetic.
+/// Memory: [`ViewColors::BYTES`] per Gaussian and view.
 #[derive(Debug, Default)]
 pub struct ViewColors {
     view_count: usize,
@@ -31,7 +31,7 @@ impl ViewColors {
     pub const BYTES: usize = size_of::<[f32; 3]>();
 
     /// Computes the colors of `gaussians` in the views of `cameras`, on all threads of the rayon pool, in place of the
-    /// present colors.
+    /// present colors. The colors of a block without a visible Gaussian are unspecified.
     pub fn fill(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
         self.view_count = cameras.len();
         self.values.resize(gaussians.len().div_ceil(BLOCK) * cameras.len() * BLOCK, [0.0; 3]);
@@ -55,8 +55,14 @@ impl ViewColors {
         self.values.par_chunks_mut((cameras.len() * BLOCK).max(1)).enumerate().for_each(fill_block);
     }
 
-    /// Returns the colors in view `view` of the block of Gaussians that begins with the Gaussian `start`.
+    /// Returns the colors in view `view` of the block of Gaussians that begins with the Gaussian `start`, a multiple of
+    /// [`BLOCK`].
+    ///
+    /// # Panics
+    /// Panics if there is no view `view`, or if colors were computed for fewer Gaussians.
     pub(super) fn block(&self, view: usize, start: usize) -> &[[f32; 3]] {
+        assert!(view < self.view_count, "view {view} of {} views with colors", self.view_count);
+        debug_assert_eq!(start % BLOCK, 0);
         &self.values[(start / BLOCK * self.view_count + view) * BLOCK..][..BLOCK]
     }
 }

@@ -19,7 +19,7 @@ pub(super) const BLOCK: usize = 128;
 pub const MIN_LOGIT: f32 = -5.54;
 
 /// Returns whether one of the Gaussians `ids` may be visible: whether its opacity is not too low ([`MIN_LOGIT`]).
+/// A Gaussian whose opacity is NaN counts as possibly visible.
 pub(super) fn has_visible(gaussians: &Gaussians, ids: Range<usize>) -> bool {
-    // The comparison is false for NaN.
     !gaussians.opacity_logit.plane(0)[ids].iter().all(|&logit| logit < MIN_LOGIT)
 }
