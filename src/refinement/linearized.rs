@@ -200,19 +200,18 @@ impl LinearizedFrames {
         let mut remaining = Attributes::all();
         for column in Attributes::all().difference(self.varying).iter() {
             let (from, to) = (first.state.attribute_values(column), state.attribute_values_mut(column));
-            let delta = change.attribute_values(column);
             match present {
                 Some(present) => *to = from.pick(present),
-                // One pass over memory instead of two, because most values are SH coefficients, which do not vary.
-                None if !delta.is_empty() && jacobian.derivative(column).width() == 0 => {
+                // The derivative is the identity. One pass over memory instead of a copy and `add_to`, because most
+                // values are SH coefficients, which do not vary.
+                None if jacobian.derivative(column).width() == 0 => {
                     remaining = remaining.difference(column);
-                    for c in 0..from.width() {
-                        let (from, to) = (from.plane(c), to.plane_mut(c));
-                        match c < delta.width() {
-                            true => to.iter_mut().zip(from).zip(delta.plane(c)).for_each(|((to, x), by)| *to = x + by),
-                            false => to.copy_from_slice(from),
-                        }
-                    }
+                    // Planes after the end of `delta` are SH coefficients of degrees that refinement does not change.
+                    let delta = change.attribute_values(column).planes();
+                    let (changed, unchanged) = to.planes_mut().split_at_mut(delta.len());
+                    let (changed_from, unchanged_from) = from.planes().split_at(delta.len());
+                    changed.iter_mut().zip(changed_from).zip(delta).for_each(|((to, from), by)| *to = from + by);
+                    unchanged.copy_from_slice(unchanged_from);
                 }
                 None => to.planes_mut().copy_from_slice(from.planes()),
             }

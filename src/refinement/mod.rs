@@ -294,7 +294,7 @@ impl RefineStage {
     fn estimate_for_views(&self, work: &Workload, limits: &Limits, [own, between]: [usize; 2]) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let read = [("readers", work.input.reader), ("kept frames", work.kept_frames_bytes(limits, Attributes::all()))];
-        // Views of one frame are rendered together, each by a renderer that keeps its buffers; colors come first.
+        // Colors are computed for several views of a frame. Then each view is rendered; renderers keep their buffers.
         let together = work.threads.min(limits.views_together as u64);
         let rendered = [("states", whole), ("views", targets::render_bytes_per_gaussian(together))];
         let original: Vec<MemoryPart> = read.into_iter().chain(rendered).collect();

@@ -54,7 +54,7 @@ const VALIDATION_VIEWS: usize = 32;
 const MIN_VALIDATION_EVERY: usize = 8;
 
 /// Number of views of a frame for which the colors of all Gaussians are computed together, before these views are
-/// rendered. It is more if more views are rendered at a time.
+/// rendered. It is rounded up to a multiple of the number of views that are rendered at the same time.
 const COLORED_VIEWS: usize = 4;
 
 /// Number n by which validation photographs are chosen: the photographs of one in n cameras. If fewer than n cameras
@@ -129,14 +129,14 @@ fn total_count(max_views: usize, pixels: u64) -> usize {
     (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize
 }
 
-/// Returns the number of views of a frame for which colors are computed together, if `together` views are rendered at a
-/// time.
+/// Returns the number of views of a frame for which colors are computed together, if `together` views are rendered at
+/// the same time. See [`COLORED_VIEWS`].
 fn colored_views(together: usize) -> usize {
     COLORED_VIEWS.next_multiple_of(together.max(1))
 }
 
-/// Returns the bytes of memory per Gaussian for the renderers and the colors of target views, if `together` views are
-/// rendered at a time.
+/// Returns how many bytes of memory per Gaussian the renderers and the colors of target views take, if `together` views
+/// are rendered at the same time.
 pub(super) fn render_bytes_per_gaussian(together: u64) -> u64 {
     together * SHARED_VIEW_BYTES_PER_GAUSSIAN + (colored_views(together as usize) * ViewColors::BYTES) as u64
 }
@@ -300,7 +300,7 @@ impl Targets {
             let subject = [RenderedSource { ids, ..RenderedSource::all_gaussians(scene.source()) }];
             let mut next = some.start;
             let limits = BatchLimits::one_frame(&scene.limits);
-            // Renderers of views that are rendered at the same time. All keep their buffers until the last batch.
+            // One renderer for each view that is rendered at the same time. It keeps its buffers until the last batch.
             let together = limits.views.max(1);
             let mut renderers: Vec<Renderer> = (0..together).map(|_| Renderer::on_all_threads()).collect();
             let mut colors = ViewColors::default();

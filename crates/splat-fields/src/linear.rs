@@ -108,7 +108,8 @@ impl Linear {
     /// of each. The outputs that fill up the last panel are included.
     #[inline(always)]
     fn for_each_output<S: InstructionSet>(&self, input: &[CacheLine], mut take: impl FnMut(usize, &CacheLine)) {
-        // Loops instead of `for_each`: its closure may not be inlined, and is then compiled without the instructions of `S`.
+        // Loops instead of `for_each`, because a closure that is not inlined is compiled without the instructions of
+        // `S`.
         let input = &input[..self.inputs];
         let wide = if S::IS_WIDE { self.bias.len() / WIDE * WIDE } else { 0 };
         for panel in (0..wide).step_by(WIDE) {
@@ -135,7 +136,8 @@ impl Linear {
         input: &[CacheLine],
         panel: usize,
     ) -> [[CacheLine; PANEL]; N] {
-        // A loop instead of `from_fn` and `map`, which may not be inlined.
+        // A loop instead of `from_fn` and `map`, because a closure that is not inlined is compiled without the
+        // instructions of `S`.
         let mut sums = [[CacheLine([0.0; LANES]); PANEL]; N];
         for (sum, &bias) in sums.as_flattened_mut().iter_mut().zip(self.bias[panel..][..N].as_flattened()) {
             *sum = CacheLine([bias; LANES]);

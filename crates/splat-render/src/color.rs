@@ -17,12 +17,13 @@ pub(super) type Colors = [[f32; BLOCK]; 3];
 /// Colors of all Gaussians of one frame in several views.
 ///
 /// They are computed block by block, for all views. If each render computed its own colors, it would read all SH
-/// coefficients (192 bytes per Gaussian with degree 3) from memory again, which takes longer than the arithmetic.
+/// coefficients (192 bytes per Gaussian with degree 3) from memory again, and reading takes longer than computing.
 /// Memory: [`ViewColors::BYTES`] per Gaussian and view.
 #[derive(Debug, Default)]
 pub struct ViewColors {
     view_count: usize,
-    /// Red, green and blue `[blocks, views, BLOCK]`: of [`BLOCK`] consecutive Gaussians in one view after the other.
+    /// Red, green and blue in the layout `[blocks, views, BLOCK]`: for each block of [`BLOCK`] consecutive Gaussians,
+    /// their colors in the first view, then in the second view, and so on.
     values: Vec<[f32; 3]>,
 }
 
@@ -30,8 +31,8 @@ impl ViewColors {
     /// Bytes of memory per Gaussian and view.
     pub const BYTES: usize = size_of::<[f32; 3]>();
 
-    /// Computes the colors of `gaussians` in the views of `cameras`, on all threads of the rayon pool, in place of the
-    /// present colors. The colors of a block without a visible Gaussian are unspecified.
+    /// Replaces all colors by those of `gaussians` in the views of `cameras`. Uses all threads of the rayon pool. The
+    /// colors of a block without a visible Gaussian are unspecified.
     pub fn fill(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
         self.view_count = cameras.len();
         self.values.resize(gaussians.len().div_ceil(BLOCK) * cameras.len() * BLOCK, [0.0; 3]);
@@ -61,7 +62,7 @@ impl ViewColors {
     /// # Panics
     /// Panics if there is no view `view`, or if colors were computed for fewer Gaussians.
     pub(super) fn block(&self, view: usize, start: usize) -> &[[f32; 3]] {
-        assert!(view < self.view_count, "view {view} of {} views with colors", self.view_count);
+        assert!(view < self.view_count, "expected the index of one of {} views, found {view}", self.view_count);
         debug_assert_eq!(start % BLOCK, 0);
         &self.values[(start / BLOCK * self.view_count + view) * BLOCK..][..BLOCK]
     }
@@ -74,7 +75,7 @@ pub(super) enum ColorSource<'a> {
     Black,
     /// Colors are computed from the SH coefficients of the Gaussians.
     Coefficients,
-    /// Colors are those of a view, given by its index.
+    /// Colors have been computed before, for several views. The number is the index of the rendered view among them.
     Computed(&'a ViewColors, usize),
 }
 

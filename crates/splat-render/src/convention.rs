@@ -1,4 +1,5 @@
-//! Constants of the original CUDA rasterizer that determine pixel values, and the block size of the projection.
+//! Constants of the original CUDA rasterizer that determine pixel values, the block size of the projection, and the
+//! test by which whole blocks are skipped.
 
 use std::ops::Range;
 
@@ -18,8 +19,8 @@ pub(super) const BLOCK: usize = 128;
 /// Opacity logit below which a Gaussian is invisible: its opacity is then at most 0.00391, which is less than 1/255.
 pub const MIN_LOGIT: f32 = -5.54;
 
-/// Returns whether one of the Gaussians `ids` may be visible: whether its opacity is not too low ([`MIN_LOGIT`]).
-/// A Gaussian whose opacity is NaN counts as possibly visible.
+/// Returns whether the opacity of any of the Gaussians `ids` is high enough to be visible: whether its logit is not
+/// below [`MIN_LOGIT`]. NaN is not below.
 pub(super) fn has_visible(gaussians: &Gaussians, ids: Range<usize>) -> bool {
     !gaussians.opacity_logit.plane(0)[ids].iter().all(|&logit| logit < MIN_LOGIT)
 }
